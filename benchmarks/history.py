@@ -11,9 +11,9 @@ from benchmarks.processes import Worker, cpu_s, leave_measured_core
 from benchmarks.queries import num_gaps
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workbench import GATEWAY, Lab
-from benchmarks.workloads import DENSE, cuts
+from benchmarks.workloads import DENSE
 from gateway.messages.encode import MESSAGE_TYPES
-from gateway.messages.history import MESSAGE_OVERHEAD_BYTES
+from gateway.messages.frame_run import FRAME_OVERHEAD_BYTES
 from gateway.outputs.zenoh.subscriber import open_zenoh
 
 TITLE: Final = "Cost of the history"
@@ -140,7 +140,7 @@ def tables(result: dict[str, Any]) -> list[Table]:
     values = result["cpu_us_per_frame"]
     without, during = result["cpu_shares"]
     packet = DENSE.packet()
-    dense_bytes = sum(cut.last - cut.first + MESSAGE_OVERHEAD_BYTES for cut in cuts(packet))
+    dense_bytes = len(packet) + FRAME_OVERHEAD_BYTES
     rows = [
         ["CPU per frame of five components, with the history", f"{statistics.median(values['on']):.2f} µs"],
         ["the same without", f"{statistics.median(values['off']):.2f} µs"],

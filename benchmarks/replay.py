@@ -15,11 +15,11 @@ import rtc3d
 
 from benchmarks.processes import Worker, run_measured
 from benchmarks.report import Goal, Progress, Table
-from gateway.messages.encode import Stamp, encode_content
+from gateway.messages.encode import Stamp, encode_message
 from gateway.outputs.lcm.connection import receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.zenoh.config import zenoh_config
-from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
+from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType
 from tests.support.takes import encode_event
 
 TITLE: Final = "A replay of 4400 messages/s as recorded"
@@ -84,7 +84,10 @@ def _write_take(path: Path, seconds: float) -> None:
                     continue
                 items = bytes(num_items * ITEM_DTYPES[component].itemsize)
                 content = struct.pack(">iqi", index, time_us, num_items) + items
-                message = encode_content(component, content, stamp, numbers[component])
+                layout = Component(
+                    component, index, time_us, num_items, len(items) // num_items, "big", content
+                )
+                message = encode_message(layout, stamp, numbers[component])
                 numbers[component] += 1
                 channel = f"MOCAP_LAB_{component.key.upper()}".encode()
                 file.write(encode_event(0, stamp.utime, channel, message))

@@ -25,7 +25,7 @@ from gateway.rtc3d.components import (
     ComponentType,
     big_endian_content,
 )
-from gateway.rtc3d.frames import ComponentLayout, RawFrame
+from gateway.rtc3d.frames import ComponentLayout, FrameLayout, RawFrame
 
 PREFIX: Final = struct.Struct(">qqqii")
 """The fields after the fingerprint: utime, capture_utime, sequence, session, parameters_version."""
@@ -124,20 +124,26 @@ def lcm_type_name(message_type: type[Any]) -> str:
 
 def encode_message(component: Component, stamp: Stamp, sequence: int) -> bytes:
     """Return the component's LCM message; ``split_frame`` has checked its size and count."""
-    return encode_content(component.type, lcm_content(component), stamp, sequence)
+    return _FINGERPRINTS[component.type] + stamp.prefix(sequence) + lcm_content(component)
 
 
-def encode_content(component_type: ComponentType, content: bytes, stamp: Stamp, sequence: int) -> bytes:
-    """Return the LCM message of a component whose content is in LCM form."""
-    return b"%b%b%b" % (_FINGERPRINTS[component_type], stamp.prefix(sequence), content)
+class ComponentEncoder:
+    """Encodes the component at ``index`` of frames with one layout."""
 
+    def __init__(self, layout: FrameLayout, index: int) -> None:
+        self.index = index
+        self._layout = layout
+        self._fingerprint = _FINGERPRINTS[layout.components[index].type]
+        self._start, self._end = layout.content_spans[index]
+        self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
 
-def frame_message(frame: RawFrame, index: int, stamp: Stamp, sequence: int) -> bytes:
-    """Return the LCM message of the component at ``index`` of a frame."""
-    layout = frame.layout.components[index]
-    if has_lcm_form(layout, frame.layout.byte_order):
-        return encode_content(layout.type, frame.content(index), stamp, sequence)
-    return encode_message(frame.component(index), stamp, sequence)
+    def message(self, body: bytes, prefix: bytes) -> bytes:
+        """Return the LCM message, with this prefix, of the component in the body of a frame."""
+        if self._has_lcm_form:
+            content = body[self._start : self._end]
+        else:
+            content = lcm_content(RawFrame(self._layout, body).component(self.index))
+        return b"%b%b%b" % (self._fingerprint, prefix, content)
 
 
 def has_lcm_form(layout: ComponentLayout, byte_order: ByteOrder) -> bool:

@@ -7,9 +7,8 @@ for again, and those are the same bytes as the outputs got.
 from collections.abc import Sequence
 from typing import Final
 
-from gateway.messages.encode import Stamp, frame_message
+from gateway.messages.encode import PREFIX, ComponentEncoder, Stamp
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import FrameLayout, RawFrame
 
 FRAME_OVERHEAD_BYTES: Final = 128
 """What a frame needs in memory besides its bytes: the heads of three objects, and a reference to each."""
@@ -28,14 +27,13 @@ class MessageNumbers:
 
 
 class NumberedLayout:
-    """A layout of frames, and the indices of those components whose messages are numbered."""
+    """Which components of the frames with one layout have messages, and with which numbers."""
 
-    def __init__(self, layout: FrameLayout, components: Sequence[tuple[int, MessageNumbers]]) -> None:
-        self.layout = layout
-        self.indices: dict[MessageNumbers, list[int]] = {}
+    def __init__(self, components: Sequence[tuple[MessageNumbers, ComponentEncoder]]) -> None:
+        self.encoders: dict[MessageNumbers, list[ComponentEncoder]] = {}
         """Usually one of each component, but a frame may repeat it."""
-        for index, numbers in components:
-            self.indices.setdefault(numbers, []).append(index)
+        for numbers, encoder in components:
+            self.encoders.setdefault(numbers, []).append(encoder)
 
 
 class FrameRun:
@@ -49,7 +47,7 @@ class FrameRun:
         self.utimes: list[int] = []
         self.capture_utimes: list[int] = []
         self._components = {
-            numbers.key: (numbers.next, indices) for numbers, indices in layout.indices.items()
+            numbers.key: (numbers.next, encoders) for numbers, encoders in layout.encoders.items()
         }
 
     def messages(self, key: str) -> "FrameMessages | None":
@@ -62,27 +60,28 @@ class FrameRun:
         """The keys of the components."""
         return list(self._components) if self.bodies else []
 
-    def message(self, number: int, index: int, sequence: int) -> bytes:
-        """Return the message of the component at ``index`` of a frame, with a sequence number."""
-        stamp = Stamp(self.utimes[number], self.capture_utimes[number], self.session, self.parameters_version)
-        return frame_message(RawFrame(self.layout.layout, self.bodies[number]), index, stamp, sequence)
+    def message(self, number: int, encoder: ComponentEncoder, sequence: int) -> bytes:
+        """Return the message of a component of one frame, with a sequence number."""
+        times = self.utimes[number], self.capture_utimes[number]
+        prefix = PREFIX.pack(*times, sequence, self.session, self.parameters_version)
+        return encoder.message(self.bodies[number], prefix)
 
 
 class FrameMessages:
     """The messages of one component of a run, the oldest at position 0."""
 
-    def __init__(self, run: FrameRun, first: int, indices: Sequence[int]) -> None:
+    def __init__(self, run: FrameRun, first: int, encoders: Sequence[ComponentEncoder]) -> None:
         self._run = run
         self._first = first
-        self._indices = indices
+        self._encoders = encoders
 
     def __len__(self) -> int:
-        return len(self._run.bodies) * len(self._indices)
+        return len(self._run.bodies) * len(self._encoders)
 
     def message(self, position: int) -> bytes:
         """Return the message at a position."""
-        number, repeated = divmod(position, len(self._indices))
-        return self._run.message(number, self._indices[repeated], self._first + position)
+        number, repeated = divmod(position, len(self._encoders))
+        return self._run.message(number, self._encoders[repeated], self._first + position)
 
     def sequence(self, position: int) -> int:
         """Return its sequence number."""
@@ -90,4 +89,4 @@ class FrameMessages:
 
     def utime(self, position: int) -> int:
         """Return when it was published, in µs since the Unix epoch."""
-        return self._run.utimes[position // len(self._indices)]
+        return self._run.utimes[position // len(self._encoders)]

@@ -4,7 +4,7 @@ Those of frames are kept as the frames that arrived, and made again when somebod
 """
 
 import time
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
@@ -212,9 +212,7 @@ class MessageHistory:
         last = newest if wanted.last is None else min(wanted.last, newest)
         messages: list[bytes] = []
         num_bytes = 0
-        for sequence, message in _messages_from(runs, first):
-            if sequence > last:
-                break
+        for message in _messages_between(runs, first, last):
             num_bytes += len(message)
             if messages and num_bytes > MAX_ANSWER_BYTES:
                 last = sequence_of(messages[-1])
@@ -338,12 +336,14 @@ def _first_since(runs: "list[_Run]", since_utime: int, otherwise: int) -> int:
     return otherwise
 
 
-def _messages_from(runs: "list[_Run]", first: int) -> Iterator[tuple[int, bytes]]:
-    """Yield the messages from number ``first`` on, with their numbers."""
+def _messages_between(runs: "list[_Run]", first: int, last: int) -> Iterator[bytes]:
+    """Yield the messages with the numbers ``first`` to ``last``."""
     for run in runs:
         if run.sequence(len(run) - 1) >= first:
-            for position in range(bisect_left(range(len(run)), first, key=run.sequence), len(run)):
-                yield run.sequence(position), run.message(position)
+            positions = range(len(run))
+            begin = bisect_left(positions, first, key=run.sequence)
+            for position in positions[begin : bisect_right(positions, last, key=run.sequence)]:
+                yield run.message(position)
 
 
 def pack_messages(messages: Sequence[bytes]) -> bytes:

@@ -8,14 +8,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from gateway.errors import QueryError
-from gateway.messages.encode import (
-    MESSAGE_TYPES,
-    Stamp,
-    encode_content,
-    frame_message,
-    has_lcm_form,
-    lcm_content,
-)
+from gateway.messages.encode import MESSAGE_TYPES, ComponentEncoder, Stamp
 from gateway.messages.frame_run import MessageNumbers, NumberedLayout
 from gateway.messages.history import FoundMessages, MessageHistory, WantedMessages
 from gateway.outputs.contract import Output, OutputStatus, ServerParameters
@@ -98,24 +91,12 @@ class _Component(MessageNumbers):
 
 
 class _ComponentPlan:
-    """How to publish one component of a layout: its index and place in the frame, and its routes."""
+    """How to publish one component of a layout."""
 
-    def __init__(
-        self, numbers: MessageNumbers, layout: FrameLayout, index: int, routes: list[TopicRoute]
-    ) -> None:
-        self.routes = routes
+    def __init__(self, numbers: MessageNumbers, encoder: ComponentEncoder, routes: list[TopicRoute]) -> None:
         self.numbers = numbers
-        self.index = index
-        self._start, self._end = layout.content_spans[index]
-        self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
-
-    def message(self, frame: RawFrame, stamp: Stamp, sequence: int) -> bytes:
-        """Return the component's message."""
-        if self._has_lcm_form:
-            content = frame.body[self._start : self._end]
-        else:
-            content = lcm_content(frame.component(self.index))
-        return encode_content(self.numbers.type, content, stamp, sequence)
+        self.encoder = encoder
+        self.routes = routes
 
 
 @dataclass
@@ -214,8 +195,8 @@ class FanOut:
         if numbers.plan is None or numbers.plan.newest is None:
             return None
         frame, stamp = numbers.plan.newest
-        index = numbers.plan.numbered.indices[numbers][-1]
-        message = frame_message(frame, index, stamp, numbers.next - 1)
+        encoder = numbers.plan.numbered.encoders[numbers][-1]
+        message = encoder.message(frame.body, stamp.prefix(numbers.next - 1))
         paced = self._paced_route(component, output)
         return message if paced is None else paced.numbered(message)
 
@@ -298,7 +279,7 @@ class FanOut:
             sequence = numbers.next
             numbers.next = sequence + 1
             if component.routes:  # otherwise, nobody needs the message now
-                message = component.message(frame, stamp, sequence)
+                message = component.encoder.message(frame.body, stamp.prefix(sequence))
                 for route in component.routes:
                     route.send(message, stamp)
         if plan.tool_indices:
@@ -314,7 +295,7 @@ class FanOut:
         num_lost = self._tool_poses.skip(frame, plan.tool_indices)
         for component in plan.components:
             numbers = component.numbers
-            message = component.message(frame, stamp, numbers.next)
+            message = component.encoder.message(frame.body, stamp.prefix(numbers.next))
             numbers.next += 1
             is_lost = [route.skip(message, stamp) for route in component.routes]
             num_lost += any(is_lost) or bool(plan.frame_routes)
@@ -328,7 +309,7 @@ class FanOut:
 
     def _change_plan(self, frame: RawFrame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
         self._plan = plan = self._plan_for(frame.layout, wanted)
-        for component in plan.numbered.indices:
+        for component in plan.numbered.encoders:
             self._components[component.type].plan = plan
         if self._item_counts.update(plan.num_items, stamp.session):
             self.on_items_changed()
@@ -339,8 +320,7 @@ class FanOut:
         plans = [
             _ComponentPlan(
                 self._components[component.type],
-                layout,
-                index,
+                ComponentEncoder(layout, index),
                 [
                     component_route
                     for route in self._routes
@@ -356,7 +336,7 @@ class FanOut:
             [route for route in self._frame_routes if plans and route.publisher.prepare(layout, wanted)],
             [index for index, each in indexed if is_used and each.type is ComponentType.TOOLS],
             {each.type: each.num_items for _, each in indexed if each.type is not ComponentType.EVENT},
-            NumberedLayout(layout, [(plan.index, plan.numbers) for plan in plans]),
+            NumberedLayout([(plan.numbers, plan.encoder) for plan in plans]),
         )
 
     def forget_layouts(self) -> None:

@@ -45,7 +45,7 @@ CONTROLS_PER_S: Final = 4.0
 
 
 _FINDS_PER_S: Final = 200.0
-"""How many times a second messages are found in the history of a source: each takes about 0.1 ms."""
+"""How many times a second messages are found in the history of a source: each takes 0.1 to 1 ms."""
 
 
 class PublishedMessages(Protocol):

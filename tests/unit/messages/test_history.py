@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
-from gateway.messages.encode import PREFIX, Stamp
+from gateway.messages.encode import PREFIX, ComponentEncoder, Stamp
 from gateway.messages.frame_run import MessageNumbers, NumberedLayout
 from gateway.messages.history import (
     MAX_ANSWER_BYTES,
@@ -24,7 +24,7 @@ from tests.support.vectors import FULL_FRAME
 
 FULL = split_frame(FULL_FRAME["big"], "big")
 MARKERS = MessageNumbers(ComponentType.MARKERS)
-LAYOUT = NumberedLayout(FULL.layout, [(0, MARKERS)])
+LAYOUT = NumberedLayout([(MARKERS, ComponentEncoder(FULL.layout, 0))])
 
 
 def message(sequence: int, utime: int = 0, size: int = 48) -> bytes:
