@@ -85,7 +85,6 @@ def test_the_history_and_the_newest_messages_are_those_of_a_plain_list(
         match operation:
             case "session":
                 session += 1
-                fan_out.forget_layouts()
             case "version":
                 version += 1
             case "forget":

@@ -322,7 +322,8 @@ def items_html(source: DisplayedSource) -> str:
 def _visibility_html(component: LiveComponent, noun: str) -> str:
     shares, num_items = component.visible_shares, len(component.newest_items)
     if not len(shares):
-        return f"<p class=dim>{counted(num_items, noun)}, no frames in the last 10 s</p>"
+        reason = ", no frames in the last 10 s" if num_items else ""
+        return f"<p class=dim>{counted(num_items, noun)}{reason}</p>"
     is_visible = component.is_visible
     units, labels = component.description.units, component.description.labels
     rows = []

@@ -70,7 +70,7 @@ def test_the_number_of_markers_changes(lab: Lab) -> None:
     lab.send_markers(True)
     assert "marker" in items_html(lab.source)
     lab.send_markers()
-    assert "0 markers" in items_html(lab.source)
+    assert "0 markers</p>" in items_html(lab.source)
 
 
 def test_events_the_newest_first(lab: Lab) -> None:
