@@ -22,6 +22,10 @@ _LOG_WINDOW_S: Final = 3600.0
 
 _STEADY_CLOCK: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # only Linux has the first
 
+_time_ns: Final = time.time_ns
+_clock_ns: Final = time.clock_gettime_ns
+"""Save looking them up: the clocks are read three times per frame."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -57,7 +61,7 @@ class HostClock:
 
         Their difference is exactly the same in every reading until the wall clock changes.
         """
-        utime, steady_us = time.time_ns() // 1000, time.clock_gettime_ns(_STEADY_CLOCK) // 1000
+        utime, steady_us = _time_ns() // 1000, _clock_ns(_STEADY_CLOCK) // 1000
         change_us = utime - steady_us - self.offset_us
         if change_us > _TOLERANCE_US or change_us < -_TOLERANCE_US:
             self._follow(steady_us)
