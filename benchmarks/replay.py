@@ -82,12 +82,10 @@ def _write_take(path: Path, seconds: float) -> None:
             for component, num_items in _ITEMS.items():
                 if index % _FRAME_EVERY and component in {ComponentType.MARKERS, ComponentType.TOOLS}:
                     continue
-                items = bytes(num_items * ITEM_DTYPES[component].itemsize)
-                content = struct.pack(">iqi", index, time_us, num_items) + items
-                layout = Component(
-                    component, index, time_us, num_items, len(items) // num_items, "big", content
-                )
-                message = encode_message(layout, stamp, numbers[component])
+                item_bytes = ITEM_DTYPES[component].itemsize
+                content = struct.pack(">iqi", index, time_us, num_items) + bytes(num_items * item_bytes)
+                encoded = Component(component, index, time_us, num_items, item_bytes, "big", content)
+                message = encode_message(encoded, stamp, numbers[component])
                 numbers[component] += 1
                 channel = f"MOCAP_LAB_{component.key.upper()}".encode()
                 file.write(encode_event(0, stamp.utime, channel, message))

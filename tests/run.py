@@ -30,7 +30,7 @@ from typing import Final
 import pytest
 
 WORKERS_PER_CORE: Final = 3
-"""Many tests wait for some of their time. With two workers, the cores were idle for a quarter of a run."""
+"""Many tests wait for some of their time. With two per core, the cores were idle for a quarter of a run."""
 
 WORKERS_S: Final = 1.0
 """When the workers are killed after Ctrl-C. By then, pytest no longer counts what they run as failed."""

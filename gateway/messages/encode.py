@@ -131,7 +131,7 @@ class ComponentEncoder:
     """Encodes the component at ``index`` of frames with one layout."""
 
     def __init__(self, layout: FrameLayout, index: int) -> None:
-        self.index = index
+        self._index = index
         self._layout = layout
         self._fingerprint = _FINGERPRINTS[layout.components[index].type]
         self._start, self._end = layout.content_spans[index]
@@ -142,7 +142,7 @@ class ComponentEncoder:
         if self._has_lcm_form:
             content = body[self._start : self._end]
         else:
-            content = lcm_content(RawFrame(self._layout, body).component(self.index))
+            content = lcm_content(RawFrame(self._layout, body).component(self._index))
         return b"%b%b%b" % (self._fingerprint, prefix, content)
 
 

@@ -37,7 +37,7 @@ class NumberedLayout:
 
 
 class FrameRun:
-    """Frames of one layout and one session, which arrived one after the other."""
+    """Frames of one layout and one session, which arrived one after the other: one at least."""
 
     def __init__(self, layout: NumberedLayout, stamp: Stamp) -> None:
         self.layout = layout
@@ -53,12 +53,12 @@ class FrameRun:
     def messages(self, key: str) -> "FrameMessages | None":
         """Return the messages of the component with this key; None if the frames have none."""
         component = self._components.get(key)
-        return None if component is None or not self.bodies else FrameMessages(self, *component)
+        return None if component is None else FrameMessages(self, *component)
 
     @property
     def keys(self) -> Sequence[str]:
         """The keys of the components."""
-        return list(self._components) if self.bodies else []
+        return list(self._components)
 
     def message(self, number: int, encoder: ComponentEncoder, sequence: int) -> bytes:
         """Return the message of a component of one frame, with a sequence number."""

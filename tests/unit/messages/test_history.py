@@ -23,8 +23,6 @@ from tests.support.clocks import Clock
 from tests.support.vectors import FULL_FRAME
 
 FULL = split_frame(FULL_FRAME["big"], "big")
-MARKERS = MessageNumbers(ComponentType.MARKERS)
-LAYOUT = NumberedLayout([(MARKERS, ComponentEncoder(FULL.layout, 0))])
 
 
 def message(sequence: int, utime: int = 0, size: int = 48) -> bytes:
@@ -181,7 +179,8 @@ def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
     host = SteppedHost(clock)
     history = MessageHistory(clock, host)
     history.set_limits(60.0, 1 << 20)
-    MARKERS.next = 0
+    markers = MessageNumbers(ComponentType.MARKERS)
+    layout = NumberedLayout([(markers, ComponentEncoder(FULL.layout, 0))])
     times: list[float] = []
     for pause_s, work, by_s in steps:
         clock.now_s += pause_s
@@ -190,8 +189,8 @@ def test_the_last_seconds_are_those_of_a_clock_that_nobody_sets(
         elif work == "maintain":
             history.begin_block()
         if are_frames:
-            history.add_frame(FULL.body, LAYOUT, Stamp(host.utime, host.utime, 1, 1))
-            MARKERS.next += 1
+            history.add_frame(FULL.body, layout, Stamp(host.utime, host.utime, 1, 1))
+            markers.next += 1
         else:
             history.add("3d", message(len(times), host.utime))
         times.append(clock.now_s)

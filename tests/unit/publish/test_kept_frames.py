@@ -28,7 +28,7 @@ READERS: Final[dict[ByteOrder, FrameReader]] = {"big": FrameReader("big"), "litt
 
 
 def random_frame(number: int, types: Sequence[ComponentType], order: ByteOrder) -> RawFrame:
-    """Return a frame whose items tell frames, and the places in a frame, apart."""
+    """Return a frame whose items differ from those of other frames, and of other components in it."""
     components = []
     for place, each in enumerate(types):
         items = np.zeros(2, SHORT_EVENT if each is EVENT else ITEM_DTYPES[each])
