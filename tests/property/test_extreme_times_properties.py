@@ -71,8 +71,8 @@ class Lab:
         )
         self.watch = RateWatch(self.status)
         self.status.state = StreamState.STREAMING
-        self.observed = ObservedComponent()
         self.steady_us = 10**9
+        self.observed = ObservedComponent(self.steady_us)
 
     def receive(self, number: int, timestamp_us: int) -> None:
         parts = [

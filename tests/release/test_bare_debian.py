@@ -1,7 +1,6 @@
 """The wheels and the sdist on a Debian 12 with Python, without compiler and network."""
 
 import os
-import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -74,7 +73,7 @@ async def test_it_is_installed_runs_is_upgraded_and_removed(
     for folder, repository in (("older", previous), ("newer", ROOT)):
         await install(machine, built(tmp_path / folder, kind, repository))
         assert (await machine.run(PROGRAM, "--version")).text.endswith(f" {KINDS[kind]}\n")
-        assert re.search(r"\b3d\W+[1-9]", (await machine.run(PROGRAM, "demo", "--seconds", "1")).text)
+        assert "Nothing was lost." in (await machine.run(PROGRAM, "demo", "--seconds", "1")).text
         machine.path("/tmp/lab.yaml").write_text("sources: [{name: lab, host: 192.0.2.20}]\n")
         checked = await machine.run(PROGRAM, "config", "check", "/tmp/lab.yaml")
         assert names(checked.text, "/tmp/lab.yaml", 1, "lab")

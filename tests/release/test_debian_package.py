@@ -4,7 +4,6 @@ The upgrade begins with the package of the previous commit.
 """
 
 import os
-import re
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -85,7 +84,7 @@ async def test_a_bare_machine_runs_the_service_at_once(bare_machine: Machine, pa
     await run("/opt/rtc3d-gateway/venv/bin/python", "-I", "-c", load)
     assert (await run("rtc3d-gateway", "--version")).text.startswith(f"rtc3d-gateway {__version__}")
     assert names((await run("rtc3d-gateway", "config", "check")).text, 1, "lab")
-    assert re.search(r"\b3d\W+[1-9]", (await run("rtc3d-gateway", "demo", "--seconds", "1")).text)
+    assert "Nothing was lost." in (await run("rtc3d-gateway", "demo", "--seconds", "1")).text
     doctor = await run("rtc3d-gateway", "doctor", check=False)
     assert doctor.status == 1
     assert names(doctor.text, "192.0.2.20:3020", "Network is unreachable")

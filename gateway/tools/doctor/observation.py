@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.encode import ITEMS_OFFSET
+from gateway.messages.host_time import now_steady_us
 from gateway.outputs.findings import MessageLoad
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType, is_visible
@@ -29,9 +30,13 @@ COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 
 
 class ObservedComponent:
-    """Statistics of the frames of one component: number, times, size, and which items are in view."""
+    """Statistics of the frames of one component: number, times, size, and which items are in view.
 
-    def __init__(self) -> None:
+    The frames were requested at ``requested_us`` on the steady clock.
+    """
+
+    def __init__(self, requested_us: int) -> None:
+        self._requested_us = requested_us
         self._num_frames = 0
         self._largest_message_bytes = 0
         self._num_items = 0
@@ -61,18 +66,23 @@ class ObservedComponent:
     def rate_hz(self) -> float:
         """Frames per second; 0 if fewer than two frames arrived.
 
-        By the server's time stamps if they increase and agree with the arrival times within a factor of 2,
-        else by arrival times. Time stamps are better because delays of the network or of this program do
-        not affect them. But some servers' time stamps are constant, jump, or are not in microseconds (field
-        note 11).
+        By the server's time stamps if they increase and agree with the arrival times, else by arrival times.
+        Time stamps are better because delays of the network or of this program do not affect them. But some
+        servers' time stamps are constant, jump, or are not in microseconds (field note 11).
         """
         intervals = self._num_frames - 1
-        span_s = (self._last_us - self._first_us) / 1e6
-        arrival_hz = intervals / span_s if intervals > 0 and span_s > 0 else 0.0
-        if intervals < 1 or any(later_us <= us for us, later_us in pairwise(self._timestamps_us)):
+        if intervals < 1:
+            return 0.0
+        watched_us, span_us = self._last_us - self._requested_us, self._last_us - self._first_us
+        arrival_hz = intervals * 1e6 / span_us if span_us > 0 else 0.0
+        if any(later_us <= us for us, later_us in pairwise(self._timestamps_us)):
             return arrival_hz
         timestamp_hz = intervals * 1e6 / (self._timestamps_us[-1] - self._timestamps_us[0])
-        is_plausible = not arrival_hz or 0.5 < timestamp_hz / arrival_hz < 2
+        # Frames that were delayed together arrive faster than they were sent, so only the time since the
+        # request says how slow they can be.
+        is_plausible = span_us <= 0 or (
+            timestamp_hz < 2 * arrival_hz and timestamp_hz * watched_us > 0.5e6 * intervals
+        )
         return timestamp_hz if is_plausible else arrival_hz
 
     @property
@@ -110,6 +120,7 @@ class ObservedStream:
             source, stream, self.status, self.session, self._read_parameters, self._planned_components
         )
         self._plans = plans
+        self._requested_us = 0
         self.plan = StreamPlan()
         """What the server's rates need, with ``streams: auto``."""
         self.shares_connection = False
@@ -122,6 +133,7 @@ class ObservedStream:
         return 0.0 if last_frame_s is None else running_clock().time() - last_frame_s
 
     def _planned_components(self, parameters: Parameters | None) -> Sequence[ComponentType]:
+        self._requested_us = now_steady_us()  # the request follows
         if self._plans:
             self.plan = plan_streams(parameters)
             self._set_components(self.plan.groups[0])
@@ -155,4 +167,6 @@ class ObservedStream:
         for frame in frames:
             for component in frame.components:
                 if component.type in self.settings.components:
-                    self.observed.setdefault(component.type, ObservedComponent()).add(component, steady_us)
+                    if component.type not in self.observed:
+                        self.observed[component.type] = ObservedComponent(self._requested_us)
+                    self.observed[component.type].add(component, steady_us)
