@@ -181,7 +181,7 @@ _REDRAW_S: Final = 10.0
 
 _DEFAULT_SIZE: Final = os.terminal_size((80, 24))
 _MAX_SIZE: Final = (1000, 500)
-_REPLACEMENTS: Final = {"…": "~", "→": ">", "↑": "^", "↓": "v", "µ": "u", "–": "-", "·": "-"}
+_REPLACEMENTS: Final = {"…": "~", "←": "<", "→": ">", "↑": "^", "↓": "v", "µ": "u", "–": "-", "·": "-"}
 
 
 class Style(Enum):

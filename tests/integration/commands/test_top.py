@@ -176,6 +176,11 @@ def test_pages_on_a_terminal_of_any_size(lab: Lab) -> None:
         assert not terminal.shows_keys()
         assert len(screen.splitlines()) == 10
         assert max(map(len, screen.splitlines())) <= 40
+        terminal.press("?")
+        screen = terminal.wait_for_screen(lambda screen: "any key back" in screen)
+        assert (len(screen.splitlines()), "Ctrl-L" in screen) == (10, False)
+        terminal.press("\x1b")
+        terminal.wait_for_screen(is_streaming)
         terminal.resize(200, 60)
         screen = terminal.wait_for_screen(lambda screen: len(screen.splitlines()) == 60)
         assert "→here ms" in screen
@@ -188,6 +193,13 @@ def test_pages_on_a_terminal_of_any_size(lab: Lab) -> None:
         terminal.wait_for_screen(lambda screen: "Tool 2" in screen)
         terminal.press("6")
         terminal.wait_for_screen(lambda screen: "connected" in screen)
+        terminal.press("?")
+        terminal.wait_for_screen(lambda screen: "sort by the next column" in screen)
+        terminal.press("?")
+        terminal.wait_for_screen(lambda screen: "connected" in screen)
+        terminal.press("/a?")
+        terminal.wait_for_screen(lambda screen: "filter: a?" in screen)
+        terminal.press("\r")
         terminal.press("q")
         assert_restored(terminal)
 
@@ -253,6 +265,8 @@ def test_plain_terminals(lab: Lab) -> None:
         in_terminal("top", *lab.lcm, TERM="dumb") as dumb,
     ):
         assert ">here ms" in plain.wait_for_screen(is_streaming)
+        plain.press("?")
+        assert "< >, h l" in plain.wait_for_screen(lambda screen: "sort by the next column" in screen)
         assert not re.search(rb"\x1b\[(?:\d;)?3\dm", plain.output)
         assert dumb.wait_for_end() == 0
         assert b"\x1b" not in dumb.output

@@ -20,17 +20,13 @@ from gateway.runtime.safe_text import safe_json, safe_text
 from gateway.tools.display.live import DisplayedSource, LiveData
 from gateway.tools.display.terminal import Keyboard, Line, Screen, Style, encoded, is_in_front, line_text
 from gateway.tools.display.top.facts import source_facts
+from gateway.tools.display.top.keys import ACTIONS, Do, help_page, short_keys
 from gateway.tools.display.top.pages import PAGES
-from gateway.tools.display.top.table import Order, TopTable, filtered, laid_out, sorted_by, wrapped
+from gateway.tools.display.top.table import LaidOut, Order, TopTable, filtered, laid_out, sorted_by, wrapped
 
 _MAX_FILTER: Final = 60
 _MAX_NOTICE_LINES: Final = 3
-_KEYS: Final = {"q": "quit", "1-8 ←→": "page", "↑↓": "scroll", "s": "sort", "r": "reverse", "/": "filter"}
-
-_PAGE_STEPS: Final = {"tab": 1, "right": 1, "l": 1, "shift-tab": -1, "left": -1, "h": -1}
-_PAGES_BY_KEY: Final = {str(number): number - 1 for number in range(1, len(PAGES) + 1)}
-_FAR: Final = 1 << 30
-"""More lines than any page has."""
+_HELP_FOOTER: Final[Line] = (("any key ", Style.STRONG), ("back to the page", Style.FAINT))
 
 
 class Display:
@@ -44,6 +40,7 @@ class Display:
         self._orders: list[Order | None] = [None] * len(PAGES)  # None: the usual one of the page
         self._filter = ""
         self._is_typing = False
+        self._is_helping = False
         self._shown = TopTable((), (), "")
         self._num_rows = 1  # that fit on the screen
         self.is_over = False
@@ -53,24 +50,34 @@ class Display:
         """Do what a key is for."""
         if self._is_typing:
             self._type(key)
-            return
-        page = max(self._num_rows - 1, 1)
-        steps = {"up": -1, "k": -1, "down": 1, "j": 1, "page-up": -page, "page-down": page, "space": page}
-        steps |= {"home": -_FAR, "g": -_FAR, "end": _FAR, "G": _FAR}
-        if key in _PAGE_STEPS:
-            self._page = (self._page + _PAGE_STEPS[key]) % len(PAGES)
-        elif key in _PAGES_BY_KEY:
-            self._page = _PAGES_BY_KEY[key]
-        elif key in steps:
-            self._offsets[self._page] = max(self._offsets[self._page] + steps[key], 0)
-        elif key in {"s", "r"}:
-            self._sort(is_reverse=key == "r")
-        elif key == "/":
-            self._is_typing = True
-        elif key == "escape":
-            self._filter = ""
-        elif key in {"q", "Q"}:
-            self.is_over = True
+        elif self._is_helping:
+            self._is_helping = False
+        elif key in ACTIONS:
+            self._do(*ACTIONS[key])
+
+    def _do(self, action: Do, number: int) -> None:
+        match action:
+            case Do.OPEN_PAGE:
+                self._page = number
+            case Do.TURN_PAGE:
+                self._page = (self._page + number) % len(PAGES)
+            case Do.SCROLL_LINES:
+                self._scroll(number)
+            case Do.SCROLL_SCREENS:
+                self._scroll(number * max(self._num_rows - 1, 1))
+            case Do.SORT | Do.REVERSE:
+                self._sort(is_reverse=action is Do.REVERSE)
+            case Do.FILTER:
+                self._is_typing = True
+            case Do.CLEAR_FILTER:
+                self._filter = ""
+            case Do.HELP:
+                self._is_helping = True
+            case Do.QUIT:
+                self.is_over = True
+
+    def _scroll(self, num_lines: int) -> None:
+        self._offsets[self._page] = max(self._offsets[self._page] + num_lines, 0)
 
     def _type(self, key: str) -> None:
         match key:
@@ -105,26 +112,38 @@ class Display:
     def lines(
         self, sources: Sequence[DisplayedSource], notices: Sequence[str], width: int, height: int
     ) -> list[Line]:
-        """Return what the screen shows: titles, the page, and at the bottom what the keys do."""
-        self._shown = PAGES[self._page].table(sources)
-        order = self._order
-        table = laid_out(sorted_by(filtered(self._shown, self._filter), order), width, order)
-        clock = time.strftime("%H:%M:%S")
-        left = f"{self._title}  {counted(len(sources), 'source')}"
-        if len(long := f"rtc3d-gateway top  {left}") + len(clock) + 2 <= width:
-            left = long
-        title: Line = [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
-        above: list[Line] = [title, self._tabs(width)]
+        """Return what the screen shows: titles, the page or the help, and at the bottom what the keys do."""
+        above: list[Line] = [self._title_line(len(sources), width), self._tabs(width)]
         shown_notices = [line for text in notices for line in wrapped(safe_text(text), width)]
         above += [[(line, Style.BAD)] for line in shown_notices[:_MAX_NOTICE_LINES]]
-        above.append(table.titles)
-        self._num_rows = max(height - len(above) - 1, 1)
-        last = max(len(table.body) - self._num_rows, 0)
+        num_rows = max(height - len(above) - 2, 1)  # without the titles of the columns and the last line
+        if self._is_helping:
+            table = help_page(width)
+            body, footer = table.body[:num_rows], _HELP_FOOTER
+        else:
+            self._num_rows = num_rows
+            table = self._table(sources, width)
+            body, footer = self._scrolled(table.body, width)
+        body += [[]] * (num_rows - len(body))
+        return [*[*above, table.titles, *body][: max(height - 1, 0)], footer]
+
+    def _title_line(self, num_sources: int, width: int) -> Line:
+        clock = time.strftime("%H:%M:%S")
+        left = f"{self._title}  {counted(num_sources, 'source')}"
+        if len(long := f"rtc3d-gateway top  {left}") + len(clock) + 2 <= width:
+            left = long
+        return [(left.ljust(width - len(clock)), Style.STRONG), (clock, Style.FAINT)]
+
+    def _table(self, sources: Sequence[DisplayedSource], width: int) -> LaidOut:
+        self._shown = PAGES[self._page].table(sources)
+        order = self._order
+        return laid_out(sorted_by(filtered(self._shown, self._filter), order), width, order)
+
+    def _scrolled(self, lines: list[Line], width: int) -> tuple[list[Line], Line]:
+        """Return those lines of the page that are in sight, and the last line of the screen."""
+        last = max(len(lines) - self._num_rows, 0)
         offset = self._offsets[self._page] = min(self._offsets[self._page], last)
-        body = table.body[offset : offset + self._num_rows]
-        body += [[]] * (self._num_rows - len(body))
-        footer = self._footer(offset, len(table.body), width)
-        return [*[*above, *body][: max(height - 1, 0)], footer]
+        return lines[offset : offset + self._num_rows], self._footer(offset, len(lines), width)
 
     def _tabs(self, width: int) -> Line:
         """Return the names of the pages; if they do not fit, the numbers of those that are not shown."""
@@ -143,9 +162,8 @@ class Display:
         parts: list[tuple[str, Style]] = []
         if self._filter:
             parts.append((f"filter: {self._filter}  ", Style.WARNING))
-            parts += [("Esc ", Style.STRONG), ("clear  ", Style.FAINT)]
-        for key, meaning in (_KEYS if self._has_keys else {}).items():
-            parts += [(f"{key} ", Style.STRONG), (f"{meaning}  ", Style.FAINT)]
+        if self._has_keys:
+            parts += short_keys(is_filtered=bool(self._filter))
         if num_lines <= self._num_rows:
             return _cut(parts, width)
         place = f" {offset + 1}–{min(offset + self._num_rows, num_lines)} of {num_lines}"

@@ -5,6 +5,7 @@ from rich.cells import cell_len
 
 from gateway.tools.display.terminal import Line, Style
 from gateway.tools.display.top.app import Display
+from gateway.tools.display.top.keys import KEYS
 from gateway.tools.display.top.pages import PAGES
 from gateway.tools.display.top.table import (
     Order,
@@ -179,6 +180,52 @@ def test_the_filter_is_typed_and_cleared() -> None:
     shown.press("/", *"nowhere")
     [nothing] = shown.body()
     assert "'nowhere'" in nothing
+
+
+HELP = "show what the keys do; any key returns"
+
+
+def shows_help(texts: list[str]) -> bool:
+    return any(HELP in text for text in texts)
+
+
+@pytest.mark.parametrize("key", ["?", "escape", "q", "2", "/", "down", "enter", "space", "x"])
+def test_any_key_returns_from_the_help_to_the_page_before(key: str) -> None:
+    """The key does nothing else: the page, its order and its place are as before."""
+    shown = Shown()
+    before = shown.press("2", "r", "down", "down")
+    assert not shows_help(before)
+    assert shows_help(shown.press("?"))
+    assert shown.press(key)[1:] == before[1:]  # without the clock
+    assert not shown.display.is_over
+
+
+def test_the_help_is_on_the_screen_with_the_pages_and_notices() -> None:
+    shown = Shown(80, 24)
+    shown.notices = ["lcm: the connection is lost"]
+    texts = shown.press("3", "?")
+    assert (len(texts), texts[2], texts[3].split()[0]) == (24, "lcm: the connection is lost", "key")
+    assert all(any(text.startswith(key.shown) for text in texts) for key in KEYS)
+    assert texts[-1] == "any key back to the page"
+    assert [text for text, style in shown.lines()[1] if style is Style.MARKED] == [" 3 tools"]
+
+
+@pytest.mark.parametrize("size", [(40, 10), (200, 60), (20, 3), (5, 2), (1, 1), (80, 24)])
+def test_the_help_fills_the_screen_and_no_more(size: tuple[int, int]) -> None:
+    shown = Shown(*size)
+    shown.notices = ["no gateway found on Zenoh; check that it is running with this prefix"] * 5
+    texts = shown.press("?")
+    assert len(texts) == size[1]
+    if size[0] >= 40:
+        assert all(cell_len(text) <= size[0] for text in texts)
+
+
+def test_in_a_filter_a_question_mark_is_text() -> None:
+    shown = Shown()
+    assert shown.press("/", "a", "?", "h")[-1] == "filter: a?h"
+    assert not shows_help(shown.texts())
+    assert shows_help(shown.press("enter", "?"))
+    assert shown.press("escape")[-1].startswith("filter: a?h  Esc clear"), "Escape only leaves the help"
 
 
 def test_q_ends() -> None:
