@@ -1,4 +1,4 @@
-"""Reading files whose paths come from a person: each may be anything else, such as a pipe or a device."""
+"""Where files are, and reading those whose paths come from a person: each may be a pipe or a device."""
 
 import errno
 import os
@@ -8,6 +8,9 @@ from typing import Final
 
 DEFAULT_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
 """The configuration file of commands that are given none; ``make install`` writes it."""
+
+SERVICE_STATE: Final = Path("/var/lib/rtc3d-gateway")
+"""The state directory of the service, outside of it; systemd/rtc3d-gateway.service names it."""
 
 MAX_FILE_BYTES: Final = 256 * 1024
 """The size limit of a configuration file; reading and checking so much text takes less than 1 s."""
@@ -40,3 +43,17 @@ def check_is_file(path: Path) -> None:
     kind = stat.S_IFMT(path.stat().st_mode)
     if kind != stat.S_IFREG:
         raise OSError(errno.EINVAL, f"it is {_KINDS.get(kind, 'something else')}, not a file")
+
+
+def folder_of(configured: str | None, name: str) -> Path:
+    """Return the folder in use: the configured one, or ``name`` in the state directory.
+
+    The state directory is that of the service, or of the user without systemd.
+    """
+    if configured is not None:
+        return Path(configured)
+    state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if state:
+        return Path(state) / name
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "rtc3d-gateway" / name

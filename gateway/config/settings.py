@@ -5,7 +5,6 @@ Mistakes raise pydantic's ValidationError. Each mistake has its location and a s
 found and what is expected. ``gateway.config.loading`` adds file, line and column.
 """
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -25,6 +24,7 @@ from pydantic.json_schema import SkipJsonSchema
 from typing_extensions import override
 
 from gateway.config import values
+from gateway.config.files import folder_of
 from gateway.config.section import Effective, Section, expects, validation_error, validation_errors
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -232,20 +232,6 @@ class OutputSettings(Section):
     def certificates(self) -> Mapping[str, Path]:
         """The files with TLS certificates that the output uses, by the names of the keys that name them."""
         return {}
-
-
-def folder_of(configured: str | None, name: str) -> Path:
-    """Return the folder in use: the configured one, or ``name`` in the state directory.
-
-    The state directory is that of the service, or of the user without systemd.
-    """
-    if configured is not None:
-        return Path(configured)
-    state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    if state:
-        return Path(state) / name
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(home) / "rtc3d-gateway" / name
 
 
 def default_folder(configured: str | None, name: str) -> dict[str, Effective]:

@@ -6,8 +6,9 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 from typing_extensions import override
 
+from gateway.config.files import folder_of
 from gateway.config.section import Effective, expects, validation_error
-from gateway.config.settings import OutputSettings, default_folder, folder_of
+from gateway.config.settings import OutputSettings, default_folder
 from gateway.config.values import AbsoluteDirectory, ChannelPrefix, Components, Switch
 from gateway.messages.topics import DEFAULT_LCM_PREFIX
 from gateway.outputs.kind import OutputKind, imported_late
