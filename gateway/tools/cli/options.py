@@ -1,4 +1,4 @@
-"""Options that several commands share: their checks, their completion, and objects of several options.
+"""Options that several commands share: their checks, and objects of several options.
 
 This module imports nothing that takes long, so that ``COMMAND --help`` is quick: the checks of values import
 what they need.
@@ -6,25 +6,23 @@ what they need.
 
 import functools
 import inspect
-import os
 import re
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, is_dataclass
 from importlib import import_module
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 import typer
 
-from gateway.config.document import VARIABLE_PREFIX, apply_overrides, read_yaml
-from gateway.config.files import DEFAULT_CONFIG, read_file
+from gateway.config.document import VARIABLE_PREFIX
+from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
 from gateway.errors import ConfigError, QueryError
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.runtime.log_format import LogFormat, LogLevel
+from gateway.tools.cli.completion import one_of, source_names
 
 if TYPE_CHECKING:
     from gateway.client.client import GatewayAddress, GatewayClient
@@ -138,41 +136,6 @@ def check_exists(option: str, path: Path | None) -> None:
     """Raise BadParameter if there is no file of this name. Not a callback: parsing must not read the disk."""
     if path is not None and not path.exists():
         raise typer.BadParameter(f"{option}: {path} does not exist")
-
-
-# What a shell offers for the values of options when the user presses Tab. It must answer at once and print
-# nothing else. So it reads files, but never asks on the network: that takes up to a second.
-
-_MAX_EVENTS: Final = 2000
-"""How many events of a take are searched for the names of its sources, which are at its beginning."""
-
-
-def one_of(words: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return the completion of an option that has one of these values."""
-    known = list(words)
-    return lambda incomplete: [word for word in known if word.startswith(incomplete)]
-
-
-def source_names(context: typer.Context, incomplete: str) -> list[str]:
-    """Complete the name of a source: of the take on the command line, or of the default configuration."""
-    # Arguments before an option without a value, which is being completed, are not parsed yet.
-    words = (context.params.get("take"), context.params.get("file"), *context.args)
-    names: list[str] = []
-    with suppress(Exception):  # whatever it is, the command itself will say it
-        take = next((Path(word) for word in words if word is not None and Path(word).exists()), None)
-        if take is not None:
-            from gateway.takes.files.event_log import EventLogReader
-            from gateway.takes.files.reader import SourceNames, log_paths
-
-            events = EventLogReader(log_paths(take)[0]).events()
-            names = SourceNames(islice(events, _MAX_EVENTS)).names
-        else:
-            text = read_file(DEFAULT_CONFIG).decode() if DEFAULT_CONFIG.exists() else "{}"
-            document = read_yaml(text, str(DEFAULT_CONFIG))
-            apply_overrides(document, os.environ)
-            names = [str(source["name"]) for source in document.values["sources"]]
-    # The shell may evaluate the text, and a take may come from anywhere.
-    return [name for name in names if re.fullmatch("[A-Za-z0-9_-]+", name) and name.startswith(incomplete)]
 
 
 SourceOption = Annotated[

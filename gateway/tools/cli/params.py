@@ -24,6 +24,7 @@ from gateway.rtc3d.parameters import (
 from gateway.runtime.quantities import counted
 from gateway.runtime.safe_text import safe_json, safe_text
 from gateway.tools.cli import options
+from gateway.tools.cli.completion import one_of
 from gateway.tools.cli.main import exit_with
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def params(
         list[str] | None,
         typer.Argument(
             metavar="SECTION",
-            autocompletion=options.one_of(SECTIONS),
+            autocompletion=one_of(SECTIONS),
             help=f"Any of {', '.join(SECTIONS)}; the default is all.",
         ),
     ] = None,

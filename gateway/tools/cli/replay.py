@@ -9,6 +9,7 @@ import typer
 from gateway.runtime.log_format import LogLevel, set_up_log
 from gateway.runtime.process_start import keep_event_loop_responsive
 from gateway.tools.cli import options
+from gateway.tools.cli.completion import take_files
 from gateway.tools.replay.timeline import MAX_GAP_S
 
 _MAX_RATE: Final = 1000.0
@@ -28,7 +29,12 @@ def _checked_rate(text: str) -> str:
 
 def replay(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="The take: a recording (.lcmlog), or the folder of one.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            autocompletion=take_files,
+            help="The take: a recording (.lcmlog), or the folder of one.",
+        ),
     ],
     rate: Annotated[
         str,

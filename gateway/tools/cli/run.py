@@ -18,7 +18,7 @@ from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 from gateway.runtime.log_format import LogLevel, set_up_log
 from gateway.runtime.process_end import end_at_once
 from gateway.runtime.process_start import keep_event_loop_responsive
-from gateway.tools.cli import options
+from gateway.tools.cli import completion, options
 
 if TYPE_CHECKING:
     import asyncio
@@ -99,7 +99,12 @@ class SceneOptions:
         ),
     ] = 2000.0
     c3d: Annotated[
-        Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
+        Path | None,
+        typer.Option(
+            "--c3d",
+            autocompletion=completion.c3d_files,
+            help="Play this C3D file instead of a synthetic scene.",
+        ),
     ] = None
 
     def settings(self) -> dict[str, Any]:
@@ -133,13 +138,14 @@ def simulate(
     take: Annotated[
         Path | None,
         typer.Option(
-            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it."
+            autocompletion=completion.take_files,
+            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it.",
         ),
     ] = None,
     source: Annotated[
         str | None,
         typer.Option(
-            autocompletion=options.source_names,
+            autocompletion=completion.source_names,
             help="The source of the take to play; needed if it has several.",
         ),
     ] = None,

@@ -22,7 +22,7 @@ from gateway.takes.export.job import (
     TakePart,
     export_take,
 )
-from gateway.tools.cli import options
+from gateway.tools.cli import completion, options
 from gateway.tools.cli.main import exit_with, print_json
 
 if TYPE_CHECKING:
@@ -118,7 +118,13 @@ def save(
 @app.command()
 def fetch(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", callback=options.checked_take_name, help="The name of the take.")
+        str,
+        typer.Argument(
+            metavar="NAME",
+            callback=options.checked_take_name,
+            autocompletion=completion.take_names,
+            help="The name of the take.",
+        ),
     ],
     file: Annotated[
         Path | None,
@@ -186,7 +192,13 @@ def list_(
 
 @app.command()
 def info(
-    file: Annotated[Path, typer.Argument(help="A recording (.lcmlog), or the folder of a saved one.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            autocompletion=completion.take_files,
+            help="A recording (.lcmlog), or the folder of a saved one.",
+        ),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     quiet: options.NoProgressOption = False,
 ) -> None:
@@ -227,7 +239,13 @@ def _print_replies(replies: "TakeReplies", text: Callable[["ListedTake"], str], 
 
 @options.with_options
 def export(
-    file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            autocompletion=completion.take_files,
+            help="The take: a recording (.lcmlog), or the folder of one.",
+        ),
+    ],
     out: Annotated[
         Path,
         typer.Argument(

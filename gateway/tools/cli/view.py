@@ -16,6 +16,7 @@ from gateway.errors import ViewError
 from gateway.outputs.listen_address import is_loopback
 from gateway.runtime.safe_text import safe_text
 from gateway.tools.cli import options
+from gateway.tools.cli.completion import take_files
 from gateway.tools.cli.run import StopSignals
 
 if TYPE_CHECKING:
@@ -42,7 +43,9 @@ def view(
     take: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[TAKE]", help="Play this take (.lcmlog, or the folder of one) instead of live data."
+            metavar="[TAKE]",
+            autocompletion=take_files,
+            help="Play this take (.lcmlog, or the folder of one) instead of live data.",
         ),
     ] = None,
     *,

@@ -3,6 +3,7 @@
 import os
 import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,11 @@ import typer
 from click.shell_completion import split_arg_string
 from typer.testing import CliRunner
 
-from gateway.tools.cli import options
+from gateway.config import files
+from gateway.takes.files.reader import SUFFIX
+from gateway.tools.cli import completion
+from gateway.tools.cli.completion import source_names
 from gateway.tools.cli.main import COMPLETION_VARIABLE, app
-from gateway.tools.cli.options import source_names
 from tests.support.gateway_process import PROGRAM
 from tests.support.takes import description, write_take
 
@@ -21,7 +24,10 @@ from tests.support.takes import description, write_take
 def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the path of the default configuration, which does not exist."""
     path = tmp_path / "default.yaml"
-    monkeypatch.setattr(options, "DEFAULT_CONFIG", path)
+    monkeypatch.setattr(completion, "DEFAULT_CONFIG", path)
+    monkeypatch.setattr(completion, "SERVICE_STATE", tmp_path / "service")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     return path
 
 
@@ -89,6 +95,153 @@ def test_sources_of_the_take_on_the_command_line_are_offered(
     take = write_take(tmp_path / "take.lcmlog", [description("hall"), description("attic")])
     line = f"rtc3d-gateway {command.format(shlex.quote(str(take)))} --source "
     assert sorted(offered(line, monkeypatch)) == ["attic", "hall"]
+
+
+def test_sources_of_the_configuration_on_the_command_line_are_offered(
+    tmp_path: Path, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_config.write_text("sources: [{name: lab, host: a}]")
+    other = tmp_path / "other.yaml"
+    other.write_text("sources: [{name: hall, host: b}]")
+    assert offered("rtc3d-gateway doctor --subscriber --source ", monkeypatch) == ["lab"]
+    assert offered(f"rtc3d-gateway doctor --config {other} --source ", monkeypatch) == ["hall"]
+
+
+def test_a_take_in_the_home_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    write_take(tmp_path / "walk.lcmlog", [description("hall")])
+    assert offered("rtc3d-gateway replay ~/walk.lcmlog --source ", monkeypatch) == ["hall"]
+    assert offered("rtc3d-gateway replay ~/w", monkeypatch) == ["~/walk.lcmlog"]
+
+
+TAKE_ARGUMENTS = ["replay", "export", "view", "take info", "simulate --take"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the working directory, with takes, other files, and folders with both."""
+    folder = tmp_path / "work"
+    for path in ("walk.lcmlog", "Run.LCMLOG", "walk.c3d", "walk.txt", ".hidden.lcmlog", "lab/jump.lcmlog"):
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).touch()
+    (folder / "lab/saved.lcmlog").mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.mark.parametrize("command", TAKE_ARGUMENTS)
+@pytest.mark.parametrize(
+    ("typed", "paths"),
+    [
+        ("", "Run.LCMLOG lab/ walk.lcmlog"),
+        ("w", "walk.lcmlog"),
+        ("./wa", "./walk.lcmlog"),
+        ("lab/", "lab/jump.lcmlog lab/saved.lcmlog/"),
+        ("lab/j", "lab/jump.lcmlog"),
+        (".h", ".hidden.lcmlog"),
+        ("walk.t", ""),
+        ("la", ""),
+        ("lab/s", ""),
+        ("nowhere/", ""),
+        ("walk.lcmlog/", ""),
+    ],
+)
+@pytest.mark.usefixtures("folder")
+def test_takes_and_folders_are_offered(
+    command: str, typed: str, paths: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where only folders fit, the shell completes them, because it writes no space after them."""
+    assert offered(f"rtc3d-gateway {command} {typed}", monkeypatch) == paths.split()
+
+
+@pytest.mark.parametrize("command", ["simulate", "demo"])
+@pytest.mark.usefixtures("folder")
+def test_c3d_files_are_offered(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered(f"rtc3d-gateway {command} --c3d ", monkeypatch) == ["lab/", "walk.c3d"]
+
+
+@pytest.mark.parametrize(
+    "name", ["my take", "a*", "$(touch x)", "a'b", "`x`", "a;b", "a\nb", "a=b", "-x", "a\udcffb", "a&"]
+)
+def test_the_shell_completes_paths_that_it_must_quote(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / f"{name}.lcmlog").touch()
+    assert offered("rtc3d-gateway replay ", monkeypatch) == []
+    assert offered("rtc3d-gateway replay wa", monkeypatch) == ["walk.lcmlog"]
+
+
+@pytest.fixture
+def takes(tmp_path: Path, default_config: Path) -> Path:
+    """Return the folder of takes of the default configuration, which has takes of two sources."""
+    takes = tmp_path / "takes"
+    for path in ("lab/walk.lcmlog", "lab/walk.c3d", "lab/a b.lcmlog", "hall/run-2.lcmlog", "x.lcmlog"):
+        (takes / path).parent.mkdir(parents=True, exist_ok=True)
+        (takes / path).touch()
+    (takes / "hall/saved").mkdir()
+    default_config.write_text(f"takes: {{directory: '{takes}'}}")
+    return takes
+
+
+@pytest.mark.usefixtures("takes")
+def test_takes_of_the_configured_folder_are_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered("rtc3d-gateway take fetch ", monkeypatch) == ["run-2", "saved", "walk"]
+    assert offered("rtc3d-gateway take fetch s", monkeypatch) == ["saved"]
+    assert offered("rtc3d-gateway take fetch --source lab ", monkeypatch) == ["walk"]
+    assert offered("rtc3d-gateway take fetch --source nowhere ", monkeypatch) == []
+    assert offered("rtc3d-gateway take start ", monkeypatch) == [], "a new take has a new name"
+
+
+@pytest.mark.parametrize("state", ["home/rtc3d-gateway", "service"])
+def test_takes_of_the_usual_folders_are_offered(
+    state: str, takes: Path, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That of a gateway of the user, and that of the service."""
+    default_config.write_text("takes: {enabled: true}")
+    (takes.parent / state).mkdir(parents=True)
+    takes.rename(takes.parent / state / "takes")
+    assert offered("rtc3d-gateway take fetch w", monkeypatch) == ["walk"]
+    default_config.unlink()
+    assert offered("rtc3d-gateway take fetch w", monkeypatch) == ["walk"]
+
+
+@pytest.mark.parametrize(
+    "content", ["takes: 3", "takes: {directory: 3}", "- a", "takes: {directory: /nowhere}"]
+)
+def test_a_bad_folder_of_takes_offers_nothing(
+    content: str, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_config.write_text(content)
+    assert offered("rtc3d-gateway take fetch ", monkeypatch) == []
+
+
+WITHOUT_NETWORK = """
+import sys
+
+sys.modules |= dict.fromkeys(["zenoh", "lcm", "numpy", "asyncio", "pydantic"])  # imports fail
+from gateway.tools.cli import completion
+from gateway.tools.cli.main import main
+
+completion.DEFAULT_CONFIG = completion.Path(sys.argv.pop())
+main()
+"""
+
+
+@pytest.mark.usefixtures("folder", "takes")
+@pytest.mark.parametrize("line", ["take fetch w", "take info w", "view w"])
+def test_nothing_that_uses_the_network_or_takes_long_is_imported(line: str, default_config: Path) -> None:
+    words = {"COMP_WORDS": f"rtc3d-gateway {line}", "COMP_CWORD": str(len(line.split()))}
+    environ = {**os.environ, COMPLETION_VARIABLE: "complete_bash", **words}
+    command = (sys.executable, "-c", WITHOUT_NETWORK, str(default_config))
+    run = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
+    assert (run.stdout.strip().removesuffix(".lcmlog"), run.stderr) == ("walk", "")
+
+
+def test_constants_are_those_of_the_reader_and_of_the_service() -> None:
+    """Their modules take long to import, or are no Python."""
+    assert completion._TAKE_SUFFIX == SUFFIX
+    unit = Path(__file__).parents[4] / "systemd/rtc3d-gateway.service"
+    assert f"StateDirectory={files.SERVICE_STATE.relative_to('/var/lib')}\n" in unit.read_text()
 
 
 HOSTILE = b"sources: [{name: '$(touch x)', host: a}, {name: \"a'b\", host: b}]"
