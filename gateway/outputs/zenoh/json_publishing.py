@@ -116,8 +116,13 @@ class JsonConverter:
             waiting.used_s += duration_s
             self._closing.wait(_REST * duration_s)
 
+    @property
+    def is_closing(self) -> bool:
+        """Whether the output closes, so that what waits is not sent."""
+        return self._closing.is_set()
+
     def close(self) -> None:
-        """End the thread."""
+        """End the thread, without waiting for the message that it converts or sends."""
         with self._lock:
             self._closing.set()
         self._thread.close()
@@ -246,7 +251,7 @@ class JsonPublisher:
             text, description = json_text(decoded), self._description_of(decoded)
             publisher.put((f"{text[:-1]},{description}}}" if description else text).encode())
         except zenoh.ZError as error:
-            if self._publisher is not None:
+            if self._publisher is not None and not self._keys.is_closing:
                 self._count_loss("put failed", f"Zenoh did not take {self._key}: {zenoh_reason(error)}")
         except BaseException as error:
             raise_unless_defect(error)

@@ -353,4 +353,6 @@ def test_closing_does_not_wait_for_what_is_to_be_converted(lab: JsonLab) -> None
         publisher.publish(event(number))
     lab.output.close()
     assert len(lab.samples) < 1000
+    assert publisher.json is not None
+    publisher.json._send(event(1000))  # as if the session had been closed meanwhile
     assert lab.lost == {}
