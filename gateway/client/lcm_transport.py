@@ -254,7 +254,8 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         keys = ".+"
         if components is not None:
             wanted = {*components, "status", "parameters"}
-            keys = "|".join("6D(_.+)?" if name == "6d" else name.upper() for name in wanted)
+            tools = "6D(_.+)?" if reception.takes_poses else "6D"
+            keys = "|".join(tools if name == "6d" else name.upper() for name in wanted)
         pattern = f"({channels})_({keys})"
         self._subscriber = LcmSubscriber(open_lcm(receiving_url(url)), pattern, self._receive)
 
@@ -263,6 +264,8 @@ class LcmGatewaySubscriber(GatewaySubscriber):
         if address.endswith(exchange) or is_presence(address, message):
             return None
         key = _KEYS_BY_FINGERPRINT.get(message[:8])
+        if key == POSE and not self._reception.takes_poses:
+            return None
         if key == POSE:
             channels, _, label = address.rpartition(_POSE_MARK)
             key = f"{POSE}{label}"

@@ -106,6 +106,7 @@ _NO_PARAMETERS: Final = Parameters()
 class LiveReception(QueuedReception[LiveSource]):
     """What ``live`` receives."""
 
+    takes_poses = False
     _start_utime = 0
 
     @property

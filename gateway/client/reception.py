@@ -45,6 +45,9 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
     ``_lock``.
     """
 
+    takes_poses = True
+    """Whether poses of single tools are wanted, which repeat what 6d has. If not, they are not requested."""
+
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         self.monotonic = monotonic
         """The clock of everything here; seconds."""

@@ -276,6 +276,8 @@ class GatewaySubscriber(ABC):
         overview = self._history_overview(source, timeout_s)
         found = []
         for key in recent_keys(overview, self._components, last_s):
+            if key.startswith(POSE) and not self._reception.takes_poses:
+                continue
             newest, utime = (overview["keys"][key].get(name) for name in ("newest", "newest_utime"))
             series = self._kept_series(source, key)
             if series is not None and isinstance(newest, int):

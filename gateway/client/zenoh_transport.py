@@ -260,7 +260,7 @@ class ZenohGatewaySubscriber(GatewaySubscriber):
                 self._source(name)
         # Never **: the gateway would make JSON of everything.
         paths = ["*"] if components is None else [*dict.fromkeys((*components, "status", "parameters"))]
-        if components is None or "6d" in components:
+        if reception.takes_poses and (components is None or "6d" in components):
             paths.append(f"{POSE}*")
         for source in sources or ("*",):
             for path in paths:

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from gateway.client import Frame, live
+from gateway.client.client import GatewayAddress, GatewayClient
+from gateway.client.reception import Messages
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
@@ -108,6 +111,32 @@ async def test_a_late_joiner_gets_what_the_gateway_has_kept_and_then_the_live_da
             return [frame.sequence for frame in frames]
 
         assert await asyncio.to_thread(receive) == list(range(150))
+
+
+@pytest.mark.parametrize("components", [None, ["6d"]], ids=["all", "6d"])
+async def test_poses_of_single_tools_are_not_received(
+    where: tuple[dict[str, Any], dict[str, Any]], components: list[str] | None
+) -> None:
+    """They repeat what 6d has, so a tool would cost as much as all of them do."""
+    gateway_options, options = where
+    async with (
+        Simulator(SyntheticScene(tools=2, rate_hz=100.0)) as simulator,
+        run_gateway(simulator.port, tool_poses=True, **gateway_options) as gateway,
+    ):
+        await wait_until_cached(gateway)
+
+        client = GatewayClient(GatewayAddress(is_lcm="url" in options, **options))
+
+        def receive() -> set[str]:
+            # Zenoh's history has poses once somebody has subscribed to them.
+            poses = client.subscribe(("lab",), ["6d"], Messages(lambda *_: None))
+            with closing(poses), live("lab", components=components, last_s=30, **options) as data:
+                tools = (frame for frame in data if frame.key == "6d")
+                assert len([frame for frame, _ in zip(tools, range(100), strict=False)]) == 100
+                return {series.key for series in data._reception.all_series}
+
+        keys = await asyncio.to_thread(receive)
+        assert [key for key in keys if key.startswith("6d")] == ["6d"]
 
 
 async def test_frames_can_be_awaited_beside_a_gateway_in_one_event_loop() -> None:

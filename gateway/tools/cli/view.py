@@ -82,7 +82,7 @@ def view(
         from gateway.tools.display.view.viewer import Playback, Viewer
         from gateway.tools.display.view.watched import WatchedSubscriber
 
-        live = LiveData()
+        live = LiveData(takes_poses=False)
         if take is None:
             client = GatewayClient(where.address(lcm=lcm))
             subscribe = partial(

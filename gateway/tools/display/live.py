@@ -250,8 +250,9 @@ class LiveData(QueuedReception[DisplayedSource]):
     Only those of the past wait until all are there: nobody wants to see the last seconds in fast motion.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, takes_poses: bool = True) -> None:
         super().__init__()
+        self.takes_poses = takes_poses
         self._past: dict[QueuedSeries, list[QueuedMessage]] = {}
 
     def update(self) -> list[DisplayedSource]:
