@@ -24,7 +24,8 @@ RELEASE_PYTHON := build/release-venv/bin/python
 SOURCES := gateway lcm_types config release pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-slow test-install test-anywhere test-compiled check beside-tests bytecode lint types contracts generated messages docs site lcm-types examples \
-    samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-tests bench-sites bench-sites-quick zenohd release \
+    samples screenshots fuzz soak stops hiroz opensim mutants bench bench-quick bench-tests bench-sites bench-sites-quick \
+    native-peers zenohd release \
     check-sums wheels reproducible deb deb-lock image workflows wheel compiled wheelhouse install install-program install-files uninstall \
     clone-url clean
 
@@ -62,7 +63,7 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/runtime/test_failu
         $(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries rtc3d session) \
-    $(addprefix tests/unit/,takes/files client/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
+    $(addprefix tests/unit/,takes/files benchmarks/test_own_cost.py client/test_recorder.py) tests/integration/test_streams.py tests/unit/daemon/test_gateway.py
 
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py $(AGAIN) --workers 3 -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
@@ -400,10 +401,10 @@ bench-tests: .venv/installed
 # two minutes, gives rough figures, and does not change the document.
 PARTS ?=
 
-bench: .venv/bench build/compiled/complete zenohd bench-tests
+bench: .venv/bench build/compiled/complete zenohd native-peers bench-tests
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
 
-bench-quick: .venv/bench build/compiled/complete bench-tests
+bench-quick: .venv/bench build/compiled/complete native-peers bench-tests
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
 
 # Measure two sites with a router each, and the link between them, and write benchmarks/sites/results.json and
@@ -411,18 +412,26 @@ bench-quick: .venv/bench build/compiled/complete bench-tests
 # PARTS as above. bench-sites-quick takes three minutes and does not change the document.
 SITES := $(COMPILED) tests/with-netns $(BIN)/python -m benchmarks.sites
 
-bench-sites: .venv/bench build/compiled/complete zenohd bench-tests build/sites/release/site-subscriber
+bench-sites: .venv/bench build/compiled/complete zenohd bench-tests native-peers
 	$(SITES) $(PARTS)
 
-bench-sites-quick: .venv/installed build/compiled/complete build/sites/release/site-subscriber
+bench-sites-quick: .venv/installed build/compiled/complete native-peers
 	$(SITES) --quick $(PARTS)
 
-# The subscribers of two sites. Without cargo, they run in Python, which a few dozen of them keep busy.
-SUBSCRIBER := benchmarks/sites/subscriber
+# Programs without Python: the subscribers of two sites, and the bare relays. Without cargo, the subscribers run in
+# Python, which a few dozen of them keep busy; without the relays, the benchmarks do not compare with them.
+NATIVE := benchmarks/native
 
-build/sites/release/site-subscriber: $(addprefix $(SUBSCRIBER)/,Cargo.toml Cargo.lock main.rs)
-	cargo build --release --locked --quiet --manifest-path $(SUBSCRIBER)/Cargo.toml --target-dir build/sites \
-	|| echo 'site-subscriber not built: the benchmarks use Python subscribers'
+native-peers: build/native/release/site-subscriber build/native/lcm-relay
+
+build/native/release/site-subscriber: $(addprefix $(NATIVE)/,Cargo.toml Cargo.lock site_subscriber.rs zenoh_relay.rs)
+	cargo build --release --locked --quiet --manifest-path $(NATIVE)/Cargo.toml --target-dir build/native \
+	|| echo 'site-subscriber and zenoh-relay not built: they need cargo'
+
+build/native/lcm-relay: $(NATIVE)/lcm_relay.c
+	mkdir -p $(@D)
+	$(CC) -O2 -Wall -Wextra -o $@ $< -llcm \
+	|| echo 'lcm-relay not built: it needs a C compiler and liblcm (Debian: liblcm-dev)'
 
 .venv/bench: .venv/installed
 	$(BIN)/pip install --quiet --group bench

@@ -1,4 +1,4 @@
-"""Part 2: the gateway and the bare relay at full speed: frames per second and CPU time per frame."""
+"""The gateway and the bare relay at full speed: frames per second and CPU time per frame."""
 
 from typing import Any, Final
 

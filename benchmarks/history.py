@@ -1,4 +1,4 @@
-"""Part 10: what the history costs: CPU time per message, memory, and CPU while somebody asks for it."""
+"""What the history costs: CPU time per message, memory, and CPU while somebody asks for it."""
 
 import json
 import statistics

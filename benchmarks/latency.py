@@ -1,4 +1,4 @@
-"""Part 3: latency and CPU time at real rates, compared with the bare relay and a plain TCP client.
+"""Latency and CPU time at real rates, compared with the bare relay and a plain TCP client.
 
 The latency is that from server to subscriber. The CPU time per frame includes waking up, and what the gateway
 does every second.

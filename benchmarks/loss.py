@@ -1,4 +1,4 @@
-"""Part 4: how many messages of the dense workload Zenoh and LCM subscribers lose."""
+"""How many messages of the dense workload Zenoh and LCM subscribers lose."""
 
 from typing import Any, Final
 

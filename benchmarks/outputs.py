@@ -1,4 +1,4 @@
-"""Part 3: what each output costs: the gateway's CPU time per frame, with nobody and with one peer.
+"""What each output costs: the gateway's CPU time per frame, with nobody and with one peer.
 
 Each output has a gateway of its own, which publishes on nothing else. The bare relay to Zenoh is measured
 beside them. All are measured one after the other, again and again, so that a slow phase of the machine

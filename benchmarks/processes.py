@@ -23,6 +23,12 @@ import yaml
 
 ROOT: Final = Path(__file__).parents[1]
 ZENOHD: Final = ROOT / "build" / "zenohd" / "bin" / "zenohd"
+NATIVE_RELAYS: Final = {
+    "zenoh": ROOT / "build" / "native" / "release" / "zenoh-relay",
+    "lcm": ROOT / "build" / "native" / "lcm-relay",
+}
+"""The bare relays without Python, by output; ``make native-peers`` builds them where it can."""
+
 _CORES: Final = sorted(os.sched_getaffinity(0))
 _START_S: Final = 120.0  # catches what hangs; on a busy machine, Zenoh took over 30 s to connect
 _END_S: Final = 10.0
@@ -214,6 +220,20 @@ def source(name: str, port: int, streams: list[dict[str, Any]] | None = None) ->
 def relay(plan: dict[str, Any]) -> Program:
     """Return the bare relay; relay.py describes ``plan``."""
     return Program([sys.executable, "-m", "benchmarks.relay", json.dumps(plan)], measured=True)
+
+
+def native_relay(plan: dict[str, Any]) -> Program:
+    """Return the bare relay without Python, to the one output of ``plan`` (see ``relay``)."""
+    name, port = plan["name"], str(plan["port"])
+    if plan["zenoh"]:
+        command = [str(NATIVE_RELAYS["zenoh"]), json.dumps(plan["zenoh"]), port]
+        for first, last, component, schema in plan["cuts"]:
+            command += [f"mocap/{name}/{component}", schema, str(first), str(last)]
+    else:
+        command = [str(NATIVE_RELAYS["lcm"]), plan["lcm"], port]
+        for first, last, component, _ in plan["cuts"]:
+            command += [f"MOCAP_{name}_{component}".upper(), str(first), str(last)]
+    return Program(command, measured=True)
 
 
 def zenoh_session_config(

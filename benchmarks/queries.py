@@ -1,4 +1,4 @@
-"""Part 7: the time and the rate of replies from the cache while the lab workload streams."""
+"""The time and the rate of replies from the cache while the lab workload streams."""
 
 import threading
 import time

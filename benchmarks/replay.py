@@ -1,4 +1,4 @@
-"""Part 8: how late the messages of a replay are, and how many a second are possible."""
+"""How late the messages of a replay are, and how many a second are possible."""
 
 import json
 import re

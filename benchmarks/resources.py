@@ -1,4 +1,4 @@
-"""Part 5: the gateway's CPU use, its peak memory, and its memory over ten minutes."""
+"""The gateway's CPU use, its peak memory, and its memory over ten minutes."""
 
 import time
 from typing import Any, Final

@@ -1,4 +1,4 @@
-"""Part 6: the gateway's CPU time per frame with 1 to 64 subscribers to 3D messages of the lab workload."""
+"""The gateway's CPU time per frame with 1 to 64 subscribers to 3D messages of the lab workload."""
 
 import statistics
 from typing import Any, Final

@@ -54,6 +54,8 @@ GATEWAY: Final = Suite(
     "benchmarks",
     (
         "own_cost",
+        "rates",
+        "live",
         "outputs",
         "ceiling",
         "latency",

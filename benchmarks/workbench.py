@@ -19,13 +19,18 @@ from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from tests.support.networks import free_port
 
 GATEWAY: Final = "lab"
+WITHOUT_HISTORY: Final = "now"
 RELAY: Final = "raw"
-"""The names of the sources. They have the same length, so that keys and channels do, too."""
+NATIVE: Final = "nat"
+"""The names of the sources: of the gateway with and without its history, of the bare relay, and of the same
+relay in C for LCM or in Rust for Zenoh. They have the same length, so that keys and channels do, too.
+"""
 
 PLAIN_TCP: Final = "tcp"
 """The name of a client that only reads the TCP connection."""
 
 _BOTH: Final = (GATEWAY, RELAY)
+_ALL: Final = (GATEWAY, WITHOUT_HISTORY, RELAY, NATIVE)
 _FIRST_FRAMES: Final = 20
 
 
@@ -48,7 +53,7 @@ def relay_cuts(workload: Workload) -> list[tuple[int, int, str, str]]:
 
 @dataclass
 class Workbench:
-    """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
+    """A context in which ``clients`` serve ``subscribers`` on Zenoh, LCM, or both; the native relay, on one.
 
     Each tuple of ``subscribers`` is one process: its number of Zenoh subscribers and of LCM subscribers.
     If ``routed``, Zenoh sessions connect only to a router. ``reads`` and ``component`` as in Subscription.
@@ -70,15 +75,14 @@ class Workbench:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-bench-")))
             self.sender = stack.enter_context(Worker(send, self.workload, list(self.clients)))
             self.ports: dict[str, int] = self.sender.started
-            endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in (*_BOTH, "router")}
-            self.lcm_urls = {GATEWAY: lcm_url(7670), RELAY: lcm_url(7680)}
+            endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in (*_ALL, "router")}
+            self.lcm_urls = {name: lcm_url(7610 + 10 * number) for number, name in enumerate(_ALL)}
             if self.routed:
                 config = processes.router_config([endpoints["router"]])
                 stack.enter_context(processes.router(folder / "router.json5", config))
-            for name in _BOTH:
-                if name in self.clients:
-                    self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))
-            reachable = ["router"] if self.routed else [name for name in _BOTH if name in self.clients]
+            for name in self.clients:
+                self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))
+            reachable = ["router"] if self.routed else self.clients
             mode = "client" if self.routed else "peer"
             config = zenoh_session_config(mode, connect=[endpoints[name] for name in reachable])
             urls = [self.lcm_urls[name] for name in self.programs]
@@ -97,25 +101,24 @@ class Workbench:
             config = zenoh_session_config("client", connect=[endpoints["router"]])
         else:
             config = zenoh_session_config("peer", listen=[endpoints[name]])
-        if name == GATEWAY:
-            return processes.gateway(folder / "gateway.yaml", self._settings(config))
-        return processes.relay(self._plan(config))
-
-    def _settings(self, zenoh_config: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "sources": [processes.source(GATEWAY, self.ports[GATEWAY])],
-            "zenoh": {"enabled": self.zenoh, "config": zenoh_config},
-            "lcm": {"enabled": self.lcm, "url": self.lcm_urls[GATEWAY]},
-            "metrics": {"port": free_port()},
-        }
-
-    def _plan(self, zenoh_config: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "name": RELAY,
-            "port": self.ports[RELAY],
-            "zenoh": zenoh_config if self.zenoh else None,
-            "lcm": self.lcm_urls[RELAY] if self.lcm else None,
+        if name in {GATEWAY, WITHOUT_HISTORY}:
+            return processes.gateway(folder / f"{name}.yaml", self._settings(name, config))
+        plan = {
+            "name": name,
+            "port": self.ports[name],
+            "zenoh": config if self.zenoh else None,
+            "lcm": self.lcm_urls[name] if self.lcm else None,
             "cuts": relay_cuts(self.workload),
+        }
+        return processes.native_relay(plan) if name == NATIVE else processes.relay(plan)
+
+    def _settings(self, name: str, zenoh_config: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "sources": [processes.source(name, self.ports[name])],
+            "zenoh": {"enabled": self.zenoh, "config": zenoh_config},
+            "lcm": {"enabled": self.lcm, "url": self.lcm_urls[name]},
+            "metrics": {"port": free_port()},
+            **({"history": {"seconds": 0}} if name == WITHOUT_HISTORY else {}),
         }
 
     def _wait_for_subscribers(self) -> None:
@@ -180,7 +183,7 @@ class Lab:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-bench-")))
             port, url = free_port(), lcm_url(7690)
             self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-            stack.enter_context(Program([sys.executable, "-m", "gateway", *_simulate(port)]))
+            stack.enter_context(Program(simulator_command(LAB, port)))
             settings = {
                 "sources": [processes.source(GATEWAY, port, LAB_STREAMS)],
                 "zenoh": {"config": zenoh_session_config("peer", listen=[self.endpoint])},
@@ -213,15 +216,17 @@ class Lab:
         return received
 
 
-def _simulate(port: int) -> list[str]:
+def simulator_command(workload: Workload, port: int) -> list[str]:
+    """Return the command that runs the simulator with a workload."""
     values = {
         "port": port,
-        "markers": LAB.markers,
-        "tools": LAB.tools,
-        "analog": LAB.analog,
-        "plates": LAB.plates,
-        "rate": LAB.rate_hz,
-        "analog-rate": LAB.analog_rate_hz,
+        "markers": workload.markers,
+        "tools": workload.tools,
+        "analog": workload.analog,
+        "plates": workload.plates,
+        "rate": workload.rate_hz,
+        "analog-rate": workload.analog_rate_hz,
         "log-level": "error",
     }
-    return ["simulate", *(f"--{name}={value}" for name, value in values.items())]
+    options = (f"--{name}={value}" for name, value in values.items())
+    return [sys.executable, "-m", "gateway", "simulate", *options]

@@ -1,4 +1,4 @@
-"""Part 5: a display far away, which gets 30 frames a second over a narrow link: how old is what it shows."""
+"""A display far away, which gets 30 frames a second over a narrow link: how old is what it shows."""
 
 import time
 from typing import Any, Final

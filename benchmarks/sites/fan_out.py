@@ -1,4 +1,4 @@
-"""Part 1: up to 256 subscribers on two sites: the gateway's CPU time, the link's bytes, and what is lost."""
+"""Up to 256 subscribers on two sites: the gateway's CPU time, the link's bytes, and what is lost."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Part 3: the link is cut, routers are killed, and a gateway is: who misses what, and for how long."""
+"""The link is cut, routers are killed, and a gateway is: who misses what, and for how long."""
 
 import contextlib
 import sys

@@ -1,4 +1,4 @@
-"""Part 4: many gateways at one router: finding them, their tables, and what each of them costs."""
+"""Many gateways at one router: finding them, their tables, and what each of them costs."""
 
 import contextlib
 import re

@@ -1,4 +1,4 @@
-"""Part 2: a link that is too slow for a while: loss is counted, and a recorder gets it later."""
+"""A link that is too slow for a while: loss is counted, and a recorder gets it later."""
 
 import time
 from typing import Any, Final

@@ -14,7 +14,7 @@ from benchmarks.processes import ROOT, tree_cpu_s, zenoh_session_config
 from benchmarks.sites.network import Namespace
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
-PROGRAM: Final = ROOT / "build" / "sites" / "release" / "site-subscriber"
+PROGRAM: Final = ROOT / "build" / "native" / "release" / "site-subscriber"
 ALL_KEYS: Final = ("mocap/*/*",)
 """The key expressions of a subscriber to everything except poses of single tools."""
 

@@ -2,14 +2,16 @@
 
 import math
 import re
+from collections.abc import Sequence
 from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
 
 from benchmarks import outputs
+from benchmarks.processes import NATIVE_RELAYS
 from benchmarks.subscribers import Received
-from benchmarks.workbench import GATEWAY, RELAY, Workbench
+from benchmarks.workbench import GATEWAY, NATIVE, RELAY, WITHOUT_HISTORY, Workbench
 from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.registry import OUTPUTS
@@ -29,20 +31,30 @@ def published(received: Received, name: str) -> dict[str, tuple[int, int]]:
 
 
 @pytest.mark.netns
-def test_the_gateway_and_the_relay_publish_the_same_number_of_messages_and_bytes() -> None:
-    with Workbench(DENSE, subscribers=[(1, 1)], reads=True) as workbench:
+@pytest.mark.parametrize("names", [("zenoh",), ("lcm",), ("zenoh", "lcm")], ids=" and ".join)
+def test_the_gateway_and_the_relays_publish_the_same_number_of_messages_and_bytes(
+    names: Sequence[str],
+) -> None:
+    """The native relays, too, where they are built."""
+    has_native = len(names) == 1 and NATIVE_RELAYS[names[0]].exists()
+    clients = [GATEWAY, WITHOUT_HISTORY, RELAY, *([NATIVE] if has_native else [])]
+    zenoh, lcm = "zenoh" in names, "lcm" in names
+    with Workbench(
+        DENSE, zenoh=zenoh, lcm=lcm, subscribers=[(zenoh, lcm)], reads=True, clients=clients
+    ) as workbench:
         workbench.settle(math.inf)  # the frames sent while subscribers connected
         workbench.take_received()
-        for name in (GATEWAY, RELAY):
+        for name in clients:
             workbench.pace(name, FRAMES, DENSE.rate_hz)
-        workbench.settle(2 * 5 * FRAMES)
+        workbench.settle(len(clients) * 5 * FRAMES)
         subscribers = workbench.take_received()
     packet = DENSE.packet()
     expected = {cut.component.key: (FRAMES, FRAMES * (cut.last - cut.first)) for cut in cuts(packet)}
     assert set(expected) == {component.key for component in ComponentType}
+    assert len(subscribers) == len(names)
     for received in subscribers:
-        assert published(received, GATEWAY) == expected
-        assert published(received, RELAY) == expected
+        for name in clients:
+            assert published(received, name) == expected
 
 
 @pytest.mark.netns
