@@ -208,14 +208,15 @@ def wait_until_it_hears_everything(path: Path) -> None:
 
 
 def wait_until_recorded(path: Path, message: bytes) -> None:
-    """Wait until a message is at the end of a recording, which may be too long to be read again and again."""
+    """Wait until a message is at the end of a recording."""
+    wait_until(lambda: is_recorded(path, message))
 
-    def is_recorded() -> bool:
-        with path.open("rb") as file:
-            file.seek(max(0, size(path) - _TAIL_BYTES))
-            return message in file.read()
 
-    wait_until(is_recorded)
+def is_recorded(path: Path, message: bytes) -> bool:
+    """Whether a message is at the end of a recording, which may be too long to be read again and again."""
+    with path.open("rb") as file:
+        file.seek(max(0, size(path) - _TAIL_BYTES))
+        return message in file.read()
 
 
 def record_past(path: Path, gateway: Lab, options: tuple[str, ...], disturb: Callable[[int], None]) -> Ended:
