@@ -26,6 +26,7 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import MESSAGE_TYPES, Stamp
 from gateway.messages.ros2.encode import TF_MESSAGE
 from gateway.outputs.adapters.ros2.source import RosSource
+from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import Declared, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.registry import OUTPUTS
@@ -291,7 +292,8 @@ def main() -> None:
     network: Any = _SilentNetwork()
     tf = RosTopic("/tf", TF_MESSAGE, lambda: None)
     tf.declare(network)
-    source = RosSource("lab", "/mocap/lab", tf, network, network, SentMessages())
+    static = StaticTransforms(lambda: None)
+    source = RosSource("lab", "/mocap/lab", tf, static, network, network, SentMessages())
     tools = Parameters6D(tools=tuple(Tool(str(number), f"Tool {number}") for number in range(_TOOLS)))
     frame = CoordinateFrame("lab", 1e-3, (0.0, 0.0, 0.6, 0.8), (1.0, 2.0, 3.0))
     source.set_parameters(ServerParameters(b"", 1, 1, parsed=Parameters(tools=tools), frame=frame))

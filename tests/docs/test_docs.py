@@ -37,7 +37,7 @@ PROGRAM = "rtc3d-gateway"
 CLONE = ("git", "clone")
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
-OTHERS = {"scrape_configs", "rule_files"}
+OTHERS = {"/tf_static", "scrape_configs", "rule_files"}
 """First keys of YAML that is Prometheus'; tests/integration/test_monitoring.py looks at it."""
 
 

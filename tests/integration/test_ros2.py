@@ -6,12 +6,14 @@ import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any, Final
 
 import zenoh
+from zenoh.ext import HistoryConfig, declare_advanced_subscriber
 
 from gateway.daemon.gateway import Gateway
-from gateway.messages.ros2.encode import ROS_TYPES
+from gateway.messages.ros2.encode import ROS_TYPES, TF_MESSAGE
 from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -29,6 +31,8 @@ TYPES: Final = {
     "/mocap/hall_2/markers": "sensor_msgs/msg/PointCloud2",
     "/mocap/hall_2/analog": "std_msgs/msg/Float32MultiArray",
     "/mocap/hall_2/force_1/wrench": "geometry_msgs/msg/WrenchStamped",
+    "/mocap/hall_2/force_1/centre_of_pressure": "geometry_msgs/msg/PointStamped",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
 }
 """A topic of each type."""
 
@@ -82,6 +86,9 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
     assert messages["/mocap/hall_2/markers"]["width"] == 3
     assert len(messages["/mocap/hall_2/analog"]["data"]) == 2
     assert messages["/mocap/hall_2/force_1/wrench"]["wrench"]["force"]["z"] != 0
+    [plate] = messages["/tf_static"]["transforms"]
+    assert (plate["header"]["frame_id"], plate["child_frame_id"]) == ("hall-2", "hall-2/force_1")
+    assert messages["/mocap/hall_2/force_1/wrench"]["header"]["frame_id"] == "hall-2/force_1"
     assert messages["/diagnostics"]["status"][0]["name"].startswith("rtc3d_gateway: hall-2")
 
     assert {topic: types for topic, types in heard["topics"].items() if topic in TYPES} == {
@@ -92,13 +99,27 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
         [publisher] = heard["publishers"][topic]
         assert (publisher["node_name"], publisher["node_namespace"]) == ("rtc3d_gateway", "/mocap")
         assert publisher["type_hash"] == hashes[type_name]
-        assert publisher["qos"].startswith("2:")  # best effort
+        is_latched = topic == "/tf_static"
+        assert publisher["qos"].startswith(":1:,1:" if is_latched else "2::")
         numbers = [sequence for sequence, _, _ in heard["attachments"][topic]]
         assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]
         assert numbers[0] >= 1
         times = [source_time_ns for _, source_time_ns, _ in heard["attachments"][topic]]
         assert times == sorted(times)
         assert len({gid for _, _, gid in heard["attachments"][topic]}) == 1
+
+
+async def test_static_transforms_reach_nodes_that_subscribe_later(router: str) -> None:
+    """With the subscription that rmw_zenoh makes if it is transient local, while another is there already."""
+    key = f"0/tf_static/{TF_MESSAGE.dds_name}/{TF_MESSAGE.type_hash}"
+    async with simulated() as server, gateway_of(settings_of(router, {"lab": server})):
+        with open_zenoh("client", connect=router) as first, open_zenoh("client", connect=router) as second:
+            for node in (first, second):
+                received: list[zenoh.Sample] = []
+                history = HistoryConfig(detect_late_publishers=True)
+                subscriber = declare_advanced_subscriber(node, key, received.append, history=history)
+                await wait_until_async(partial(len, received))
+                assert subscriber is not None
 
 
 async def test_a_reload_adds_and_removes_sources_and_the_output(router: str) -> None:

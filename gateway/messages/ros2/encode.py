@@ -117,6 +117,10 @@ WRENCH_STAMPED: Final = RosType(
     "geometry_msgs/msg/WrenchStamped",
     "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
 )
+POINT_STAMPED: Final = RosType(
+    "geometry_msgs/msg/PointStamped",
+    "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
+)
 TF_MESSAGE: Final = RosType(
     "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 )
@@ -132,7 +136,9 @@ DIAGNOSTIC_ARRAY: Final = RosType(
     "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
 )
 
-ROS_TYPES: Final = (POSE_STAMPED, WRENCH_STAMPED, TF_MESSAGE, POINT_CLOUD, FLOAT_ARRAY, DIAGNOSTIC_ARRAY)
+ROS_TYPES: Final = (
+    *(POSE_STAMPED, WRENCH_STAMPED, POINT_STAMPED, TF_MESSAGE, POINT_CLOUD, FLOAT_ARRAY, DIAGNOSTIC_ARRAY),
+)
 """All of them."""
 
 
@@ -146,6 +152,9 @@ pack_pose: Final = struct.Struct("<7d").pack
 
 pack_wrench: Final = struct.Struct("<6d").pack
 """Encodes a geometry_msgs/Wrench: force x, y, z in N, and torque x, y, z in Nm."""
+
+pack_point: Final = struct.Struct("<3d").pack
+"""Encodes a geometry_msgs/Point: x, y, z in m."""
 
 POINT: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reliability", "<f4"), ("marker", "<u4")])
 """One point of a cloud: position, the server's reliability, and the marker's index."""
@@ -186,17 +195,17 @@ def ros_stamps(utimes: Array) -> Array:
 
 
 class StampedEncoder:
-    """Encodes geometry_msgs/PoseStamped and WrenchStamped of one frame."""
+    """Encodes geometry_msgs/PoseStamped, WrenchStamped and PointStamped of one frame."""
 
     def __init__(self, frame_id: str) -> None:
         self._frame_id = CdrWriter(_STAMP_BYTES).string(frame_id).align(8).content
 
     def encode(self, stamp: bytes, content: bytes) -> bytes:
-        """Return a message with the result of ``pack_pose`` or ``pack_wrench``."""
+        """Return a message with the result of ``pack_pose``, ``pack_wrench`` or ``pack_point``."""
         return b"%b%b%b%b" % (ENCAPSULATION, stamp, self._frame_id, content)
 
     def encode_rows(self, stamps: Array, values: Array) -> list[bytes]:
-        """Return a message for each row of ``values``: a wrench or a pose, shape (rows, 6) or (rows, 7)."""
+        """Return a message for each row of ``values``: points (rows, 3), wrenches (…, 6) or poses (…, 7)."""
         return _rows(ENCAPSULATION, stamps, self._frame_id, values.astype("<f8"))
 
 

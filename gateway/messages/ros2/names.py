@@ -14,6 +14,7 @@ from gateway.messages.transliteration import without_accents
 DEFAULT_NAMESPACE: Final = "mocap"
 
 TF: Final = "/tf"
+TF_STATIC: Final = "/tf_static"
 MARKERS: Final = "markers"
 ANALOG: Final = "analog"
 """The topics of markers and channels, below that of their source."""
@@ -48,6 +49,8 @@ def unique_ros_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
         name = ros_name(label, noun)
         if name == noun:
             name = f"{noun}_{position}"
+        elif _PLATE_NAME.fullmatch(name):
+            name = f"{noun}_{name}"  # on /tf, plates and tools are side by side
         names[unique_name(name, names, MAX_PART_CHARS)] = None
     return tuple(names)
 
@@ -57,11 +60,19 @@ def pose_topic(tool: str) -> str:
     return f"{tool}/pose"
 
 
+_PLATE_NAME: Final = re.compile(r"force_\d+")
+
+
 def plate_name(number: int) -> str:
     """Return the name of a force plate, counted from 1."""
     return f"force_{number}"
 
 
 def wrench_topic(plate: str) -> str:
-    """Return the topic of a force plate, below that of its source."""
+    """Return the topic of the load on a force plate, below that of its source."""
     return f"{plate}/wrench"
+
+
+def pressure_topic(plate: str) -> str:
+    """Return the topic of the centre of pressure on a force plate, below that of its source."""
+    return f"{plate}/centre_of_pressure"

@@ -18,6 +18,7 @@ from gateway.messages.topics import Topic, unique_name
 from gateway.outputs.adapters.ros2.diagnostics import DiagnosticsPublisher
 from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.adapters.ros2.source import RosSource
+from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import FramePublisher, OutputHealth, Publisher, ServerParameters
 from gateway.outputs.frame_output import FrameOutput, in_this_loop
@@ -93,6 +94,7 @@ class Ros2Output(FrameOutput):
         self._confirmation = RouterConfirmation(self._router)
         self._sender: WorkerThread | None = None  # from start to close
         self._tf = RosTopic(TF, TF_MESSAGE, self._on_tf_wanted)
+        self._static = StaticTransforms(lambda: self.submit(self._static.send))
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
         self._node: RosNode | None = None  # only in the sending thread
         self._names: dict[str, str] = {}  # by source, also those that are gone
@@ -114,6 +116,7 @@ class Ros2Output(FrameOutput):
         """Declare everything on the new session, in the sending thread."""
         self._node = node = RosNode(session, self.settings)
         self._diagnostics.declare(node)
+        self._static.declare(node)
         self._declare_tf()
         for source in list(self._sources.values()):
             source.declare(node)
@@ -145,6 +148,7 @@ class Ros2Output(FrameOutput):
         self._confirmation.check()
         for topic in (self._tf, self._diagnostics):
             topic.check_subscribers()
+        self._static.check_subscribers()
         for source in list(self._sources.values()):
             source.check_subscribers()
 
@@ -158,7 +162,7 @@ class Ros2Output(FrameOutput):
         name = self._names[source]
         base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
         self._sources[source] = publisher = RosSource(
-            *(source, base, self._tf, self._router, self), self._confirmation.of(source)
+            *(source, base, self._tf, self._static, self._router, self), self._confirmation.of(source)
         )
         self.submit(lambda: None if self._node is None else publisher.declare(self._node))
         return publisher
@@ -244,5 +248,5 @@ class Ros2Output(FrameOutput):
         """Remove all topics, in the sending thread."""
         for source in list(self._sources.values()):
             source.undeclare()
-        for topic in (self._tf, self._diagnostics):
+        for topic in (self._tf, self._static, self._diagnostics):
             topic.undeclare()

@@ -21,6 +21,7 @@ from gateway.messages.encode import Stamp
 from gateway.messages.ros2.encode import (
     FLOAT_ARRAY,
     POINT_CLOUD,
+    POINT_STAMPED,
     POSE_STAMPED,
     WRENCH_STAMPED,
     AnalogEncoder,
@@ -28,6 +29,7 @@ from gateway.messages.ros2.encode import (
     RosType,
     StampedEncoder,
     TransformNames,
+    pack_point,
     pack_pose,
     pack_wrench,
     ros_stamp,
@@ -38,9 +40,12 @@ from gateway.messages.ros2.names import (
     MARKERS,
     plate_name,
     pose_topic,
+    pressure_topic,
     unique_ros_names,
     wrench_topic,
 )
+from gateway.messages.ros2.plates import PlateFrame, plate_frames
+from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh.config import zenoh_reason
@@ -82,17 +87,25 @@ class _Tool(NamedTuple):
 
 
 class _Plate(NamedTuple):
-    topic: RosTopic
+    wrench: RosTopic
+    pressure: RosTopic | None
+    frame: PlateFrame | None  # if its place is known
+    stamped: StampedEncoder
     newtons: float
     newton_metres: float
+
+    @property
+    def topics(self) -> list[RosTopic]:
+        return [self.wrench] if self.pressure is None else [self.wrench, self.pressure]
 
 
 class RosSource:
     """A FramePublisher: the sending thread publishes each frame of which somebody receives something.
 
     ``name`` is the source's name in the configuration, ``base`` the beginning of its topics: /mocap/lab.
-    ``tf`` is the topic /tf, which all sources share. There the frames of tools begin with the source's name,
-    so that they differ even if sources have the same frame: lab/wand. ``sent`` counts what Zenoh has taken.
+    ``tf`` is the topic /tf, which all sources share, and ``static`` has /tf_static. There, frames of tools
+    and plates begin with the source's name, so that they differ even if sources have one frame: lab/wand.
+    ``sent`` counts what Zenoh has taken.
     """
 
     def __init__(
@@ -100,6 +113,7 @@ class RosSource:
         name: str,
         base: str,
         tf: RosTopic,
+        static: StaticTransforms,
         router: SessionHolder,
         sender: Sender,
         sent: SentMessages,
@@ -115,6 +129,7 @@ class RosSource:
         """The parts of topics by component key and label, where they differ. Any thread may read it."""
         self._base = base
         self._tf = tf
+        self._static = static
         self._router = router
         self._sender = sender
         self._sent = sent
@@ -226,6 +241,7 @@ class RosSource:
         """Remove all topics from ROS."""
         for topic in self._by_name.values():
             topic.undeclare()
+        self._static.set_transforms(self.name, ())
         self._by_name = {}
         self._by_component = {}
         self.topics = ()
@@ -254,6 +270,8 @@ class RosSource:
         for topic in self._former.values():
             topic.undeclare()
         self._former = {}
+        frames = [plate.frame for plate in self._plates if plate.frame is not None]
+        self._static.set_transforms(self.name, [frame.transform for frame in frames])
 
     def _begin_with(self, parameters: ServerParameters) -> None:
         self._described_by = parameters
@@ -286,7 +304,7 @@ class RosSource:
         self.topics = tuple(self._by_name.values())
         self._by_component = {
             ComponentType.TOOLS: (self._tf, *(tool.topic for tool in self._tools)),
-            ComponentType.FORCE: tuple(plate.topic for plate in self._plates),
+            ComponentType.FORCE: tuple(topic for plate in self._plates for topic in plate.topics),
             ComponentType.MARKERS: () if self._markers is None else (self._markers,),
             ComponentType.ANALOG: () if self._analog is None else (self._analog,),
         }
@@ -302,14 +320,18 @@ class RosSource:
         self._show_names(ComponentType.TOOLS, labels, names)
 
     def _open_plates(self, num_plates: int) -> None:
-        force = self._described_by.parsed.force
-        plates = force.plates if force else ()
+        parsed = self._described_by.parsed
+        plates = parsed.force.plates if parsed.force else ()
+        frames = plate_frames(parsed, self._frame, self.name)
         names = [*map(plate_name, range(1, num_plates + 1))]
         for index in range(len(self._plates), num_plates):
-            topic = self._topic(wrench_topic(names[index]), WRENCH_STAMPED)
-            newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
-            self._plates.append(_Plate(topic, newtons, newton_metres))
-        labels = describe(ComponentType.FORCE, self._described_by.parsed, num_plates).labels
+            name, frame = names[index], frames[index] if index < len(frames) else None
+            wrench = self._topic(wrench_topic(name), WRENCH_STAMPED)
+            pressure = None if frame is None else self._topic(pressure_topic(name), POINT_STAMPED)
+            stamped = self._stamped if frame is None else StampedEncoder(frame.frame_id)
+            units = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
+            self._plates.append(_Plate(wrench, pressure, frame, stamped, *units))
+        labels = describe(ComponentType.FORCE, parsed, num_plates).labels
         self._show_names(ComponentType.FORCE, labels, names)
 
     def _show_names(self, component: ComponentType, labels: Sequence[str], names: Sequence[str]) -> None:
@@ -400,16 +422,25 @@ class RosSource:
         self._put(topic, cloud, now_ns)
 
     def _send_forces(self, component: Component, stamp: bytes, now_ns: int) -> None:
-        if not any(plate.topic.wanted for plate in self._plates):
+        if not any(topic.wanted for plate in self._plates for topic in plate.topics):
             return
         self._count_too_many("force plates", component.num_items, MAX_PLATES)
         items = component.items()[: len(self._plates)]
-        vectors = self._frame.vectors(items.view(items.dtype["fx"]).reshape(-1, 3))
-        for (topic, n, nm), load in zip(self._plates, vectors.reshape(-1, 6).tolist(), strict=False):
-            if topic.wanted and not any(map(math.isnan, load)):
-                fx, fy, fz, mx, my, mz = load
+        values = items.view(items.dtype["fx"])
+        turned = self._frame.vectors(values.reshape(-1, 3)).reshape(-1, 6)
+        for plate, load, (fx, fy, fz, mx, my, mz) in zip(
+            self._plates, values.reshape(-1, 6).tolist(), turned.tolist(), strict=False
+        ):
+            if any(map(math.isnan, load)):
+                continue
+            if plate.wrench.wanted:
+                n, nm = plate.newtons, plate.newton_metres
                 wrench = pack_wrench(fx * n, fy * n, fz * n, mx * nm, my * nm, mz * nm)
-                self._put(topic, self._stamped.encode(stamp, wrench), now_ns)
+                self._put(plate.wrench, plate.stamped.encode(stamp, wrench), now_ns)
+            if plate.pressure is not None and plate.pressure.wanted and plate.frame is not None:
+                centre = plate.frame.centre_of_pressure(load)
+                if centre is not None:  # without contact, there is none
+                    self._put(plate.pressure, self._stamped.encode(stamp, pack_point(*centre)), now_ns)
 
     def _send_analog(self, topic: RosTopic, component: Component, now_ns: int) -> None:
         if self._channels.num_channels != component.num_items:

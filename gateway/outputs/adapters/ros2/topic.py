@@ -32,10 +32,11 @@ _ATTACHMENT: Final = struct.Struct(f"<qqB{_GID_BYTES}s")
 
 
 class QoS(NamedTuple):
-    """The quality of service of a publisher. All are volatile and keep the last ``depth`` messages."""
+    """The quality of service of a publisher, which keeps the last ``depth`` messages."""
 
     is_reliable: bool
     depth: int
+    is_transient_local: bool = False
 
     @property
     def code(self) -> str:
@@ -45,9 +46,15 @@ class QoS(NamedTuple):
 
         The fields are reliability, durability, history and depth, deadline, lifespan and liveliness.
         """
-        best_effort = "2"
+        best_effort, transient_local = "2", "1"
+        reliability = "" if self.is_reliable else best_effort
+        durability = transient_local if self.is_transient_local else ""
         depth = "" if self.depth == _DEFAULT_DEPTH else self.depth
-        return f"{'' if self.is_reliable else best_effort}::,{depth}:,:,:,,"
+        return f"{reliability}:{durability}:,{depth}:,:,:,,"
+
+
+LATCHED: Final = QoS(is_reliable=True, depth=1, is_transient_local=True)
+"""The quality of service of topics whose newest message late subscribers need, too."""
 
 
 class Node(NamedTuple):
@@ -155,15 +162,15 @@ class RosNode:
         """Declare the publisher of a topic. ``on_matching`` is called in one of Zenoh's threads."""
         settings = self._settings
         type_hash = topic.type.hash_in(settings.distribution)
+        qos = LATCHED if topic.is_latched else QoS(self._is_reliable, settings.depth)
         publisher = declare_publisher(
             self._session,
             data_key(settings.domain_id, topic.name, topic.type, type_hash),
             on_matching,
             congestion_control=zenoh.CongestionControl.DROP,
-            reliability=zenoh.Reliability.RELIABLE if self._is_reliable else zenoh.Reliability.BEST_EFFORT,
+            reliability=zenoh.Reliability.RELIABLE if qos.is_reliable else zenoh.Reliability.BEST_EFFORT,
         )
         self._last_entity_id += 1
-        qos = QoS(self._is_reliable, settings.depth)
         token = self._node.publisher_token(self._last_entity_id, topic.name, topic.type, type_hash, qos)
         return Declared(publisher, self._session.liveliness().declare_token(token), gid_of(token))
 
@@ -187,10 +194,19 @@ class RosTopic:
     ``on_wanted_changed`` is called in one of Zenoh's threads when subscribers come or when all have gone.
     """
 
-    def __init__(self, name: str, ros_type: RosType, on_wanted_changed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        name: str,
+        ros_type: RosType,
+        on_wanted_changed: Callable[[], None],
+        *,
+        is_latched: bool = False,
+    ) -> None:
         self.name = name
         """With a leading slash."""
         self.type = ros_type
+        self.is_latched = is_latched
+        """Whether subscriptions to it are transient local, as usual: see LATCHED."""
         self.wanted = False
         """Whether there is a subscriber."""
         self._on_wanted_changed = on_wanted_changed

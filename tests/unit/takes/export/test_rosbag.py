@@ -15,7 +15,8 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, Parameters6D, ParametersForce, Plate, Tool
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
-from gateway.takes.export.job import ExportJob
+from gateway.takes.export.job import ExportJob, export_take
+from tests.support.documents import ROOT
 from tests.support.errors import each_names, one_names, raises
 from tests.support.takes import START_UTIME, Message, frame, parameters, scene_messages
 from tests.unit.takes.export.exported import NAN, export_messages, labelled, notes_of
@@ -29,6 +30,9 @@ TYPES = {
     "/mocap/lab/analog": "std_msgs/msg/Float32MultiArray",
     "/mocap/lab/force_1/wrench": "geometry_msgs/msg/WrenchStamped",
     "/mocap/lab/force_2/wrench": "geometry_msgs/msg/WrenchStamped",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/mocap/lab/force_1/centre_of_pressure": "geometry_msgs/msg/PointStamped",
+    "/mocap/lab/force_2/centre_of_pressure": "geometry_msgs/msg/PointStamped",
 }
 
 
@@ -87,6 +91,30 @@ def test_a_bag_has_the_values_of_the_take_in_the_units_of_ros(tmp_path: Path) ->
     assert np.allclose(values, lab.forces.values[:, 1] * factors)
     assert notes_of(job) == []
     assert one_names(notes_of(job, usual=True), "labels of tools", "lab", "Tool_1")
+
+
+def test_loads_act_at_the_centre_of_pressure_in_the_frame_of_their_plate(tmp_path: Path) -> None:
+    """A person walks: moved there by /tf_static, each load has no moment but the one about the vertical."""
+    source = open_take(ROOT / "examples/walk.lcmlog").sources["lab"]
+    export_take(ExportJob(ROOT / "examples/walk.lcmlog", tmp_path / "walk.mcap", "ros2"))
+    bag = Bag(tmp_path / "walk.mcap")
+    [(_, static)] = bag.messages["/tf_static"]
+    origins = {
+        each.child_frame_id: np.array(triple(each.transform.translation)) for each in static.transforms
+    }
+    assert source.forces is not None
+    for number in (1, 2):
+        loads = dict(bag.messages[f"/mocap/lab/force_{number}/wrench"])
+        centres = bag.messages[f"/mocap/lab/force_{number}/centre_of_pressure"]
+        assert 100 < len(centres) < len(loads)
+        for time_ns, centre in centres:
+            load = loads[time_ns]
+            force, moment = (np.array(triple(each)) for each in (load.wrench.force, load.wrench.torque))
+            arm = np.array(triple(centre.point)) - origins[load.header.frame_id]
+            about_centre = moment - np.cross(arm, force)
+            assert abs(about_centre[:2]).max() < 1e-3 * abs(force[2])  # N at an arm of 1 mm
+            assert abs(arm[2]) < 1e-9
+            assert abs(arm[:2]).max() < 0.35  # on the plate
 
 
 def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
@@ -160,7 +188,8 @@ def test_the_frame_and_the_transform_are_those_of_the_newest_status(tmp_path: Pa
     fx, fy, fz = lab.forces.values[0, 0, :3]
     assert np.allclose(triple(wrench.wrench.force), (-fy, fx, fz), atol=1e-4)
     _, pose = bag.messages["/mocap/lab/Tool_1/pose"][0]
-    assert {cloud.header.frame_id, wrench.header.frame_id, pose.header.frame_id} == {"world"}
+    assert {cloud.header.frame_id, pose.header.frame_id} == {"world"}
+    assert wrench.header.frame_id == "lab/force_1"
 
 
 def status(

@@ -11,6 +11,7 @@ import pytest
 from gateway.errors import OutputError
 from gateway.messages.ros2.encode import TF_MESSAGE
 from gateway.outputs.adapters.ros2.source import RosSource
+from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosTopic
 from gateway.outputs.contract import OutputHealth, ServerParameters
 from gateway.outputs.zenoh.confirmation import SentMessages
@@ -138,10 +139,13 @@ class Source:
     def __init__(self, given: ServerParameters | None = None, *, is_declared: bool = True) -> None:
         self.node, self.router, self.sender = Node(), Router(), Sender()
         self.tf = RosTopic("/tf", TF_MESSAGE, self._update_wanted)
+        self.static = StaticTransforms(self._send_static)
         self.messages_sent = SentMessages()
         router: Any = self.router
         sender: Any = self.sender
-        self.publisher = RosSource("lab", "/mocap/lab", self.tf, router, sender, self.messages_sent)
+        self.publisher = RosSource(
+            *("lab", "/mocap/lab", self.tf, self.static, router, sender, self.messages_sent)
+        )
         self.publisher.losses = Losses(logging.getLogger("tests"), "lab to ros2")
         self.num_changes = 0
         self.publisher.on_wanted_changed = self._note_change
@@ -153,16 +157,20 @@ class Source:
     def _update_wanted(self) -> None:
         self.publisher.update_wanted()
 
+    def _send_static(self) -> None:
+        self.static.send()
+
     def _note_change(self) -> None:
         self.num_changes += 1
 
     def declare(self) -> None:
         self.tf.declare(self.node)  # type: ignore[arg-type]
+        self.static.declare(self.node)  # type: ignore[arg-type]
         self.publisher.declare(self.node)  # type: ignore[arg-type]
 
     def subscribe(self, *names: str, is_there: bool = True) -> None:
         """Let subscribers come to these topics, or to all; or go."""
-        for topic in (self.tf, *self.publisher.topics):
+        for topic in (self.tf, self.static._topic, *self.publisher.topics):
             if not names or topic.name in names:
                 topic._on_matching(is_there)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.adapters.ros2.source import MAX_PLATES, MAX_TOOLS
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
-from gateway.rtc3d.parameters import ForceChannel, Plate
+from gateway.rtc3d.parameters import ForceChannel, Plate, Point
 from tests.support import ros_messages as ros
 from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, stamp, tools_frame
 from tests.unit.outputs.adapters.ros2.scripted_ros import Source, cause_of
@@ -257,6 +257,62 @@ def test_forces_and_torques_have_units_of_their_own() -> None:
     [message] = source.node.messages["/mocap/lab/force_1/wrench"]
     expected = (1000.0, 2000.0, 3000.0, 0.004, 0.005, 0.006)
     assert struct.unpack("<6d", message[-48:]) == pytest.approx(expected)
+
+
+SQUARE = ((200, 200, 0), (-200, 200, 0), (-200, -200, 0), (200, -200, 0))
+UNITS = (*("N",) * 3, *("Nmm",) * 3)
+
+
+def placed_plate(x: float, y: float) -> Plate:
+    """Return a plate whose centre is at x, y in mm, on the floor."""
+    corners = tuple(Point(x + dx, y + dy, z, unit="mm") for dx, dy, z in SQUARE)
+    return Plate("1", corners=corners, channels=tuple(ForceChannel(unit, unit=unit) for unit in UNITS))
+
+
+def test_the_load_on_a_plate_is_in_a_frame_at_the_centre_of_its_surface() -> None:
+    """500 N downwards, 30 mm in x and -20 mm in y from the centre, give Mx = 10 Nm and My = 15 Nm.
+
+    Quarter turn about z, then 1 m in x: the server's (x, y) becomes (1 - y, x).
+    """
+    half = math.sqrt(0.5)
+    frame = CoordinateFrame("hall", 1e-3, (0.0, 0.0, half, half), (1.0, 0.0, 0.0))
+    plates = (placed_plate(600, 300), Plate("2"))
+    source = Source(parameters(("wand",), plates=plates, frame=frame))
+    source.subscribe()
+    source.send(frame_of((FORCE, [(0.0, 0.0, -500.0, 10_000.0, 15_000.0, 0.0), LOAD])))
+    [static] = source.message("/tf_static", "tf2_msgs/msg/TFMessage").transforms
+    assert (static.header.frame_id, static.child_frame_id) == ("hall", "lab/force_1")
+    moved, turned = static.transform.translation, static.transform.rotation
+    assert (moved.x, moved.y, moved.z) == pytest.approx((0.7, 0.6, 0.0))
+    assert (turned.x, turned.y, turned.z, turned.w) == (0.0, 0.0, 0.0, 1.0)
+    load = source.message("force_1/wrench", "geometry_msgs/msg/WrenchStamped")
+    assert load.header.frame_id == "lab/force_1"
+    assert (load.wrench.torque.x, load.wrench.torque.y) == pytest.approx((-15.0, 10.0))
+    pressure = source.message("force_1/centre_of_pressure", "geometry_msgs/msg/PointStamped")
+    assert pressure.header.frame_id == "hall"
+    assert (pressure.point.x, pressure.point.y) == pytest.approx((0.7 + 0.02, 0.6 + 0.03))
+    assert source.message("force_2/wrench", "geometry_msgs/msg/WrenchStamped").header.frame_id == "hall"
+    assert "/mocap/lab/force_2/centre_of_pressure" not in source.node.open
+    source.send(frame_of((FORCE, [(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), LOAD])))  # nobody stands there
+    assert (len(source.sent["force_1/wrench"]), len(source.sent["force_1/centre_of_pressure"])) == (2, 1)
+
+
+def test_static_transforms_are_published_again_to_those_who_come_later() -> None:
+    source = Source(parameters(plates=(placed_plate(0, 0),)))
+    assert "/tf_static" not in source.sent
+    source.subscribe("/tf_static")
+    source.node.matching.add("/tf_static")
+    source.static.check_subscribers()
+    assert source.sent["/tf_static"] == [1, 2]
+    source.use(parameters(plates=(placed_plate(100, 0),), version=2))
+    assert source.sent["/tf_static"] == [1, 2, 3]
+    source.use(parameters(version=3))
+    assert "/tf_static" not in source.node.open
+
+
+def test_the_frames_of_plates_and_tools_differ() -> None:
+    source = Source(parameters(("force_1",), plates=(placed_plate(0, 0),)))
+    assert {"/mocap/lab/tool_force_1/pose", "/mocap/lab/force_1/wrench"} < source.node.open
 
 
 @pytest.mark.parametrize("counts", [(3, 1, 2), (0, 2)])
