@@ -38,7 +38,7 @@ CLONE = ("git", "clone")
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
 OTHERS = {"/tf_static", "scrape_configs", "rule_files"}
-"""First keys of YAML that is Prometheus'; tests/integration/test_monitoring.py looks at it."""
+"""First keys of YAML for ROS, and for Prometheus, at which tests/integration/test_monitoring.py looks."""
 
 
 def commands() -> list[tuple[str, tuple[str, ...]]]:
