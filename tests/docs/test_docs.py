@@ -134,7 +134,8 @@ def test_commands_have_these_subcommands_and_options(place: str, words: tuple[st
 
 
 def test_files_and_make_targets_that_commands_name_are_there() -> None:
-    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    makefiles = "\n".join(path.read_text() for path in (ROOT / "Makefile", *ROOT.glob("*/*.mk")))
+    targets = set(re.findall(r"^([\w-]+):", makefiles, re.MULTILINE))
     for place, (program, *arguments) in COMMANDS:
         if program == "make" and "-C" not in arguments:
             assert {word for word in arguments if "=" not in word} <= targets, place

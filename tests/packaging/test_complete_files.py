@@ -81,7 +81,7 @@ def test_a_killed_download_leaves_no_package_of_debian(
 def test_a_killed_build_leaves_no_image(tmp_path: Path) -> None:
     tree = tmp_path / "tree"
     shutil.copytree(ROOT / "release/image", tree / "release/image")
-    for file in ("Makefile", "gateway/__init__.py"):
+    for file in ("Makefile", "release/release.mk", "gateway/__init__.py"):
         (tree / file).parent.mkdir(exist_ok=True)
         shutil.copyfile(ROOT / file, tree / file)
     [dist, build] = [tree / name for name in ("dist", "build")]
