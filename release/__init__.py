@@ -1,1 +1,1 @@
-"""Programs that build, describe and check a release. CONTRIBUTING.md says how to make one."""
+"""Programs that build, describe and check a release. docs/dev/releasing.md says how to make one."""
