@@ -6,7 +6,7 @@ command that needs no outputs does not import it.
 """
 
 import re
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from logging import getLogger
 from typing import Final
 
@@ -22,7 +22,7 @@ from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.settings import LCM
 from gateway.outputs.takes.settings import TAKES
 from gateway.outputs.zenoh.settings import ZENOH
-from gateway.runtime.safe_text import safe_text
+from gateway.runtime.entry_points import add_installed
 
 GROUP: Final = "rtc3d_gateway.outputs"
 """The group of entry points in which packages name their OutputKind."""
@@ -52,20 +52,11 @@ def build_outputs(settings: Settings) -> list[Output]:
 
 def add_installed_outputs() -> None:
     """Add the outputs of other packages to OUTPUTS, and to UNUSABLE those that cannot be used."""
-    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, entry.value)):
-        try:
-            OUTPUTS[entry.name] = _load(entry)
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - what a package does must not stop the gateway
-            package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
-            what = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-            UNUSABLE[entry.name] = safe_text(
-                f"the output {entry.name} of the package {package} cannot be used: {' '.join(what.split())}; "
-                "repair, update or uninstall the package"
-            )
+    UNUSABLE.update(add_installed(GROUP, "output", _add))
 
 
-def _load(entry: EntryPoint) -> OutputKind:
-    """Return the kind that an entry point names. Raises ConfigError, and whatever its module raises."""
+def _add(entry: EntryPoint) -> None:
+    """Add the kind that an entry point names. Raises ConfigError, and whatever its module raises."""
     if not _is_free(entry.name):
         raise ConfigError(
             f"the name {entry.name!r} is taken, or has other characters than a to z, 0 to 9 and _"
@@ -78,7 +69,7 @@ def _load(entry: EntryPoint) -> OutputKind:
     section = kind.settings()  # raises ValidationError if a key has no default
     if not isinstance(section, OutputSettings):
         raise ConfigError(f"its settings are of the type {type(section).__name__}, not OutputSettings")
-    return kind
+    OUTPUTS[entry.name] = kind
 
 
 def _is_free(name: str) -> bool:

@@ -5,6 +5,7 @@
   ``log_format`` has the formats of the log, and ``safe_text`` cuts and escapes text from networks.
 - ``quantities``: sizes, durations, rates and counts as text.
 - ``token_bucket``: a limit of a rate. ``server_limits``: what the clients of a server may use up.
+- ``entry_points``: what other packages add, and why one of them cannot be used.
 - ``process_end``: the signals and the end of a command. ``program_end``: the end of other people's programs
   that use this package, and their forks.
 """

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pytest
 import zenoh
 
@@ -118,11 +119,9 @@ def test_every_command_of_take_to_bids_prints_the_output_on_the_page(
     assert {path.name for path in (folder / "study").glob("sub-*")} == {"sub-01", "sub-02"}
 
 
-@pytest.mark.wheelhouse
-def test_the_output_of_a_package_of_ones_own_works_as_on_the_page(
-    folder: Path, terminals: dict[str, Terminal], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The package goes to a virtual environment that sees the gateway and what it needs."""
+@pytest.fixture
+def installing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install packages to a virtual environment that sees the gateway and what it needs."""
     for name, value in pip_environment().items():
         monkeypatch.setenv(name, value)
     shutil.rmtree(folder / ".venv")
@@ -132,7 +131,24 @@ def test_the_output_of_a_package_of_ones_own_works_as_on_the_page(
     program = folder / ".venv/bin/rtc3d-gateway"
     program.write_text(f"#!{folder}/.venv/bin/python\nfrom gateway.__main__ import main\nmain()\n")
     program.chmod(0o755)
+
+
+@pytest.mark.wheelhouse
+@pytest.mark.usefixtures("installing")
+def test_the_output_of_a_package_of_ones_own_works_as_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
     assert follow("docs/how-to/write-an-output.md", folder, terminals) == 6
+
+
+@pytest.mark.wheelhouse
+@pytest.mark.usefixtures("installing")
+def test_the_export_format_of_a_package_of_ones_own_works_as_on_the_page(
+    folder: Path, terminals: dict[str, Terminal]
+) -> None:
+    assert follow("docs/how-to/write-an-export-format.md", folder, terminals) == 2
+    first = np.loadtxt(folder / "walk-Head.tum")[0]
+    assert first == pytest.approx([1795358960.727806, 0.2, -2.485, 1.552, 0, 0, 0, 1], abs=1e-6)
 
 
 FRAME_12: Final = "frame 12: 23 of 24 markers in view\nframe 13: 24 of 24 markers in view\n"

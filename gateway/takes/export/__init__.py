@@ -1,9 +1,9 @@
 """Converting takes to the files of other programs: C3D, OpenSim's, BIDS, MCAP, bags of ROS 2, Parquet, CSV.
 
-``job`` lists the formats, says which part of which take becomes which file, creates the files, and collects
-what has to be reported. C3D, BIDS and OpenSim's files have one rate, so ``measurements`` divides a take into
-parts with one rate and one set of labels, and ``grid`` gives each frame a row by its number and time stamp,
-which ``row_shifts`` and ``period`` compare.
+``registry`` lists the formats, also those of other packages. ``job`` says which part of which take becomes
+which file, creates the files, and collects what has to be reported. C3D, BIDS and OpenSim's files have one
+rate, so ``measurements`` divides a take into parts with one rate and one set of labels, and ``grid`` gives
+each frame a row by its number and time stamp, which ``row_shifts`` and ``period`` compare.
 MCAP, and the tables in CSV and Parquet, keep the time of capture of each frame.
 
 - ``c3d``: the groups of a C3D file, its events and its bytes; ``c3d_content`` has points and channels.

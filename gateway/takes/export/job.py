@@ -1,75 +1,33 @@
 """An export: which part of which take becomes which file, in which format, and what is reported about it.
 
-The formats are imported when they are used: the command line lists them, and numpy is slow to import.
+It imports numpy and what needs it late: the command line imports this module, and numpy is slow to import.
 """
 
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from gateway.config.words import join_or
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.topics import unique_name
-from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
+from gateway.takes.export.registry import (
+    CHOSEN_FORMATS,
+    FORMATS,
+    UNUSABLE,
+    Format,
+    add_installed_formats,
+)
 from gateway.takes.files.new_file import NewFiles
 
 if TYPE_CHECKING:
     from gateway.takes.files.take import Take, TakeSource
 
 
-class Format(NamedTuple):
-    """A format: the module and the function that write the files of a job, and what they keep of a take.
-
-    ``components`` are the keys of those that it has; ``keeps_details`` says whether it has the subject, the
-    session and the note. ``lacks`` is what else it never has, in words, by the component that has it, or
-    "parameters"; "" stands for all components.
-    """
-
-    module: str
-    function: str
-    components: Collection[str] = COMPONENTS_BY_KEY.keys()
-    keeps_details: bool = True
-    lacks: Mapping[str, str] = MappingProxyType({})
-
-
-_RELIABILITIES: Final = {"3d": "reliabilities of markers"}
-_PARAMETERS: Final = {"parameters": "parameters except labels and units"}
-_FOR_VIEWERS: Final = {"6d": "errors of tools", "": "frame numbers, server's time stamps"}
-
-FORMATS: Final = {
-    ".c3d": Format("c3d", "export_c3d", ("3d", "analog", "force", "event")),
-    ".trc": Format("trc", "export_trc", ("3d",), keeps_details=False, lacks=_RELIABILITIES),
-    ".mot": Format("opensim", "export_mot", ("force",), keeps_details=False),
-    ".sto": Format("opensim", "export_sto", ("analog",), keeps_details=False),
-    ".csv": Format("csv_files", "export_csv", keeps_details=False, lacks=_PARAMETERS),
-    ".parquet": Format("parquet", "export_parquet", lacks=_PARAMETERS),
-    ".mcap": Format("mcap", "export_mcap", lacks=_FOR_VIEWERS),
-}
-"""The formats by the extension of the new file."""
-
-CHOSEN_FORMATS: Final = {
-    "opensim": Format(
-        "opensim",
-        "export_opensim",
-        ("3d", "analog", "force"),
-        keeps_details=False,
-        lacks=_RELIABILITIES,
-    ),
-    "bids": Format("bids", "export_bids"),
-    "ros2": Format("rosbag", "export_rosbag", ("3d", "6d", "analog", "force"), lacks=_FOR_VIEWERS),
-}
-"""The formats that an option chooses."""
-
 _FOLDERS: Final = ("opensim", "bids")
 """Those whose files are in a folder, ``out``."""
-
-_EXTRAS: Final = {".mcap": ("foxglove-sdk", "foxglove"), ".parquet": ("pyarrow", "parquet")}
-"""The package that files of an extension need, and the extra that installs it."""
 
 _NOUNS: Final = {
     "3d": "markers",
@@ -90,6 +48,7 @@ _NOT_IN_NAMES: Final = re.compile(r"[/\x00-\x1f\x7f-\x9f]")
 
 def export_take(job: "ExportJob") -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
+    add_installed_formats()
     extension = job.out.suffix.lower()
     if job.format == "ros2" and extension != ".mcap":
         raise SelectionError(f"{job.out} does not end in .mcap, as a bag of ROS 2 does; add .mcap")
@@ -98,23 +57,14 @@ def export_take(job: "ExportJob") -> list[Path]:
             f"--{job.format} writes a folder, and {job.out} is the name of a file; omit {extension}"
         )
     if not job.format and extension not in FORMATS:
+        if extension in UNUSABLE:
+            raise TakeError(f"{job.out} cannot be written: {UNUSABLE[extension]}")
         raise SelectionError(
             f"{job.out} has no known extension; choose {join_or(FORMATS)}, "
             "or --opensim or --bids for a folder"
         )
-    chosen = job.chosen_format
     with job.files:
-        try:
-            write = getattr(import_module(f"gateway.takes.export.{chosen.module}"), chosen.function)
-        except ImportError as error:
-            if extension not in _EXTRAS:
-                raise
-            package, extra = _EXTRAS[extension]
-            raise TakeError(
-                f"{job.out} cannot be written without {package}; "
-                f"install it: pip install 'rtc3d-gateway[{extra}]'"
-            ) from error
-        write(job)
+        job.chosen_format.write(job)
         job.note_rows()
         job.progress(f"saving {job.out.name}", 0, 0)
     return job.files.paths

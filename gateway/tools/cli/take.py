@@ -14,7 +14,6 @@ from gateway.config.words import join_or
 from gateway.errors import QueryError
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.export.job import (
-    FORMATS,
     Axis,
     BidsNames,
     ExportJob,
@@ -22,6 +21,7 @@ from gateway.takes.export.job import (
     TakePart,
     export_take,
 )
+from gateway.takes.export.registry import FORMATS, UNUSABLE
 from gateway.tools.cli import completion, options
 from gateway.tools.cli.main import exit_with, print_json
 
@@ -249,8 +249,8 @@ def export(
     out: Annotated[
         Path,
         typer.Argument(
-            help=f"The new file; its extension is the format: {join_or(FORMATS)}. "
-            "With --opensim or --bids, a folder."
+            help="The new file; its extension is the format: "
+            f"{join_or([*FORMATS, 'one of an installed package'])}. With --opensim or --bids, a folder."
         ),
     ],
     *,
@@ -349,6 +349,8 @@ def export(
     print_list(Console(stderr=True), ["file", "changed, rounded or left out", "how much"], job.notes)
     for path in paths:
         print(f"{path} ({size_text(path.stat().st_size)})")
+    for text in UNUSABLE.values():
+        print(f"note: {text}", file=sys.stderr)
 
 
 @contextmanager

@@ -25,14 +25,12 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes.export.job import (
-    CHOSEN_FORMATS,
-    FORMATS,
     BidsNames,
     ExportJob,
-    Format,
     TakePart,
     export_take,
 )
+from gateway.takes.export.registry import CHOSEN_FORMATS, FORMATS, Format
 from tests.support.takes import (
     START_UTIME,
     Message,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from gateway.rtc3d.parameters import Plate
-from gateway.takes.export.job import CHOSEN_FORMATS, FORMATS, BidsNames, ExportJob
+from gateway.takes.export.job import BidsNames, ExportJob
+from gateway.takes.export.registry import CHOSEN_FORMATS, FORMATS
 from tests.support.errors import one_names
 from tests.support.takes import Message
 from tests.unit.takes.export.exported import C3d, export_messages, notes_of, scene
