@@ -14,6 +14,9 @@ from tests.support.waiting import wait_until
 
 RATE_HZ: Final = 100
 
+TOLERANCE_S: Final = 1.0
+"""How late the frames of a busy machine may be; the steps are of 5 s and more."""
+
 STEP: Final = re.compile(r"(forward|back) by (\d+\.\d{3}) s")
 """What the log says about the clock: the direction and the seconds."""
 
@@ -113,7 +116,8 @@ def assert_step_changes_time_stamps_only(gateway: GatewayProcess, offset_s: floa
         assert gaps([header.frame_number for header in headers]) == []
         assert all(header.capture_utime <= header.utime for header in headers)
         offsets_s = capture_offsets_s(gateway, component)[RATE_HZ:]
-        followed = [abs(each - offset_s) < 0.1 for each in offsets_s]
+        followed = [abs(each - offset_s) < TOLERANCE_S for each in offsets_s]
         assert followed == sorted(followed), "the capture time follows once, and for good"
         assert followed.count(True) >= 2 * RATE_HZ - 10
-        assert all(abs(each) < 0.1 for each, has in zip(offsets_s, followed, strict=True) if not has)
+        before = [each for each, has_followed in zip(offsets_s, followed, strict=True) if not has_followed]
+        assert all(abs(each) < TOLERANCE_S for each in before)

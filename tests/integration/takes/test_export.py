@@ -202,6 +202,7 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
         expected_counts = {b"MOCAP_LAB_3D": 340, b"MOCAP_LAB_ANALOG": 3400}
         for channel, count in expected_counts.items():
             wait_until(lambda: take.exists() and take.read_bytes().count(channel) == count, 60)  # noqa: B023
+        wait_until(lambda: b"MOCAP_LAB_PARAMETERS" in take.read_bytes())  # late on a busy machine
         record.send_signal(signal.SIGINT)
         assert record.wait(30) == 0
     assert names_values(run_in_process("export", take, copy).stderr, "time 0")
