@@ -28,9 +28,9 @@ from tests.support.configurations import MODEL, load
 from tests.support.documents import ROOT, Block, all_blocks, blocks, documents
 from tests.support.fresh_clones import clone_into, files_in
 from tests.support.log_messages import messages
-from tests.support.operations_page import update
+from tests.support.log_messages_page import update
 
-OPERATIONS = (ROOT / "docs/operations.md").read_text()
+LOG_MESSAGES = (ROOT / "docs/reference/log-messages.md").read_text()
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
 WHAT_IS_LOST = (ROOT / "docs/explanation/what-is-lost.md").read_text()
 PROGRAM = "rtc3d-gateway"
@@ -231,10 +231,10 @@ def test_the_design_names_every_module() -> None:
     assert modules - {"__init__", "__main__"} <= named
 
 
-def test_the_page_about_operations_has_the_messages_of_the_source_code_and_advice_for_each() -> None:
+def test_the_page_of_log_messages_is_that_of_the_source_code_with_advice_for_each() -> None:
     """After a change of a message, ``make messages`` writes the page; only the advice is written by hand."""
     in_source = messages(ROOT / "gateway")
-    result = update(OPERATIONS, in_source)
+    result = update(LOG_MESSAGES, in_source)
     assert result.without_advice == []
-    assert result.page == OPERATIONS, "run make messages"
+    assert result.page == LOG_MESSAGES, "run make messages"
     assert len(in_source) > 150  # the messages are found at all

@@ -1,7 +1,7 @@
 """Finds the messages that the gateway can log at WARNING and above, in its source code.
 
 The text of a message has placeholders named after the expressions in the source: ``f"no answer from {peer}"``
-is ``no answer from <peer>``. tests/support/operations_page.py writes them into docs/operations.md.
+is ``no answer from <peer>``. tests/support/log_messages_page.py writes them into the page of log messages.
 """
 
 import ast

@@ -1,6 +1,6 @@
-"""Writes the messages of the source code into the tables of docs/operations.md: ``make messages``.
+"""Writes the messages of the source code into docs/reference/log-messages.md: ``make messages``.
 
-People write only the last column of these tables, the advice, and decide which messages share a row. The
+People write only the last column of its tables, the advice, and decide which messages share a row. The
 other columns come from the source code. If a sentence changes there, its row gets the new one and keeps its
 advice.
 """
@@ -15,11 +15,10 @@ from typing import Final
 from tests.support.documents import ROOT
 from tests.support.log_messages import Message, messages
 
-PAGE: Final = ROOT / "docs/operations.md"
+PAGE: Final = ROOT / "docs/reference/log-messages.md"
 
 _ROW: Final = re.compile(r"\| (`.*`) \| (?:WARNING|ERROR) \|(.*)\|")
 _SEPARATOR: Final = "`; `"
-_HEADING: Final = "### "
 _SAME_SENTENCE: Final = 0.6
 """Two texts that are less alike (0 to 1) are two messages, and not two wordings of one."""
 

@@ -1,13 +1,13 @@
-"""The tool that writes the messages of the source code into docs/operations.md."""
+"""The tool that writes the messages of the source code into docs/reference/log-messages.md."""
 
 from pathlib import Path
 
 import pytest
 
 from tests.support.log_messages import Message, messages
-from tests.support.operations_page import update
+from tests.support.log_messages_page import update
 
-HEAD = "#### Server\n\n| message | level | what to do |\n|---|---|---|\n"
+HEAD = "## Server\n\n| message | level | what to do |\n|---|---|---|\n"
 PAGE = (
     f"{HEAD}"
     "| `no answer from <server>; is it on?` | WARNING | Switch it on. |\n"
