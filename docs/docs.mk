@@ -1,10 +1,14 @@
 # The documents, besides `make docs` (Makefile).
-.PHONY: messages site screenshots clone-url
+.PHONY: messages options site screenshots clone-url
 
-# Write the messages of level WARNING and above from the source code into the tables of docs/reference/log-messages.md. A changed
+# Write the messages of level WARNING and above from the source code into docs/reference/log-messages.md. A changed
 # sentence keeps its advice; messages without advice are named. `make test` checks that the page is up to date.
 messages: .venv/installed ## write the messages of the source code into docs/reference/log-messages.md
 	$(BIN)/python -m tests.support.log_messages_page
+
+# What people wrote below the help of a command stays.
+options: .venv/installed ## write the help of the commands into docs/reference/commands.md
+	$(BIN)/python -m tests.support.commands_page
 
 # Commit the site of this version to the branch gh-pages, beside those of other versions: /1.0/, to which /latest/ leads.
 # `git push origin gh-pages` publishes it.

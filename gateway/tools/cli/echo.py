@@ -14,8 +14,8 @@ from gateway.tools.cli.main import exit_with
 @options.with_options
 def echo(
     *,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
+    zenoh: options.ZenohOption = False,
+    lcm: options.LcmOption = False,
     output: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Subscribe on the output with this name, such as zenoh or lcm."),

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 @options.with_options
 def list_gateways(
     *,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Look on Zenoh (the default).")] = False,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
+    zenoh: options.ZenohOption = False,
+    lcm: options.LcmOption = False,
     source: options.SourceOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     where: options.AddressOptions,
@@ -101,7 +101,7 @@ def _via(source: SourceReport) -> str:
 
 
 def found_json(found: "FoundSources") -> dict[str, Any]:
-    """Return the JSON object that docs/reference/commands.md describes."""
+    """Return the JSON object that docs/reference/command-json.md describes."""
     sources = [
         {
             "source": source.name,

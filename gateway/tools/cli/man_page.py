@@ -43,8 +43,8 @@ def man_page() -> str:
         *_entry("\\fB\\-h\\fR, \\fB\\-\\-help\\fR", "Show the help of the program, or of a command."),
         ".SH COMMANDS",
     ]
-    for name, command in _commands(group, ""):
-        arguments = [f"\\fI{_value(each)}\\fR" for each in command.params if not _is_option(each)]
+    for name, command in commands(group):
+        arguments = [f"\\fI{_text(value_word(each))}\\fR" for each in command.params if not is_option(each)]
         lines.append(" ".join([".SS", _text(name), "[\\fIOPTIONS\\fR]", *arguments]))
         for number, paragraph in enumerate((command.help or "").split("\n\n")):
             lines += [".PP"] * (number > 0) + [_text(" ".join(paragraph.split()))]
@@ -65,24 +65,37 @@ def man_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _commands(group: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+def commands(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield every command that is not a group, with its name."""
     for name in group.list_commands(None):
         command = group.get_command(None, name)
         if isinstance(command, typer.core.TyperGroup):
-            yield from _commands(command, f"{prefix}{name} ")
+            yield from commands(command, f"{prefix}{name} ")
         else:
             yield f"{prefix}{name}", command
 
 
-def _is_option(parameter: Any) -> bool:
+def is_option(parameter: Any) -> bool:
+    """Return False for an argument."""
     return isinstance(parameter, typer.core.TyperOption)
 
 
-def _value(parameter: Any) -> str:
+def value_word(parameter: Any) -> str:
     """Return the word for the value of an option or an argument, such as SECONDS."""
     longest = max(parameter.opts, key=len).strip("-")
-    return _text(parameter.metavar or longest.upper().replace("_", "-"))
+    return str(parameter.metavar or longest.upper().replace("_", "-"))
+
+
+def help_text(parameter: Any) -> str:
+    """Return the help of an option or an argument, with its default."""
+    text = str(parameter.help or "")
+    default = parameter.default
+    if default is None or isinstance(default, bool):
+        return text
+    shown = default.value if isinstance(default, Enum) else default
+    return (
+        f"{text} The default is {shown:g}." if isinstance(shown, float) else f"{text} The default is {shown}."
+    )
 
 
 def _parameters(parameters: list[Any]) -> list[str]:
@@ -90,16 +103,11 @@ def _parameters(parameters: list[Any]) -> list[str]:
     for parameter in parameters:
         if getattr(parameter, "hidden", False):
             continue
-        title = f"\\fI{_value(parameter)}\\fR"
-        if _is_option(parameter):
+        title = f"\\fI{_text(value_word(parameter))}\\fR"
+        if is_option(parameter):
             names = ", ".join(f"\\fB{_text(name)}\\fR" for name in sorted(parameter.opts, key=len))
             title = names if parameter.is_flag else f"{names} {title}"
-        text = parameter.help or ""
-        default = parameter.default
-        if default is not None and not isinstance(default, bool):
-            shown = default.value if isinstance(default, Enum) else default
-            text += f" The default is {shown:g}." if isinstance(shown, float) else f" The default is {shown}."
-        lines += _entry(title, text)
+        lines += _entry(title, help_text(parameter))
     return lines
 
 

@@ -160,7 +160,7 @@ SourcesOption = Annotated[
         "--source",
         callback=_checked_source,
         autocompletion=source_names,
-        help="Only this source; can be repeated. The default is all sources.",
+        help="Only this source; can be repeated.",
     ),
 ]
 ComponentsOption = Annotated[
@@ -172,9 +172,12 @@ ComponentsOption = Annotated[
         help=f"Only this: {join_or(_RECORDED)}; can be repeated.",
     ),
 ]
+ZenohOption = Annotated[bool, typer.Option("--zenoh", help="Use Zenoh (the default).")]
+LcmOption = Annotated[bool, typer.Option("--lcm", help="Use LCM instead of Zenoh.")]
 ConnectOption = Annotated[
     str | None,
     typer.Option(
+        metavar="ENDPOINT",
         callback=_checked_endpoint,
         help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447.",
     ),
@@ -182,14 +185,16 @@ ConnectOption = Annotated[
 ListenOption = Annotated[
     str | None,
     typer.Option(
-        callback=_checked_endpoint, help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448."
+        metavar="ENDPOINT",
+        callback=_checked_endpoint,
+        help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448.",
     ),
 ]
 ZenohConfigOption = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help="Zenoh's configuration (JSON5) for this command's session: endpoints, certificates, password.",
+        help="Zenoh's configuration (JSON5): certificates, password, endpoints unless --connect is given.",
     ),
 ]
 UrlOption = Annotated[

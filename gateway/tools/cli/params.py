@@ -42,12 +42,10 @@ def params(
         ),
     ] = None,
     *,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Query on Zenoh (the default).")] = False,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Query on LCM.")] = False,
+    zenoh: options.ZenohOption = False,
+    lcm: options.LcmOption = False,
     source: options.SourceOption = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     as_xml: Annotated[bool, typer.Option("--xml", help="Print the server's XML unchanged.")] = False,
     fresh: Annotated[
         bool,

@@ -37,7 +37,7 @@ def record(
         ),
     ] = None,
     details: options.DetailsOptions,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
+    lcm: options.LcmOption = False,
     where: options.AddressOptions,
     quiet: options.NoProgressOption = False,
 ) -> None:

@@ -41,8 +41,7 @@ _NameArgument = Annotated[
         help="The name of the take; the default is SOURCE-DATE-TIME.",
     ),
 ]
-_LcmOption = Annotated[bool, typer.Option("--lcm", help="Ask on LCM instead of Zenoh.")]
-_JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")]
+_JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 @app.command()
@@ -53,7 +52,7 @@ def start(
     details: options.DetailsOptions,
     source: options.SourceOption = None,
     as_json: _JsonOption = False,
-    lcm: _LcmOption = False,
+    lcm: options.LcmOption = False,
     query: options.QueryOptions,
 ) -> None:
     """Start a take in a running gateway. Needs takes.enabled and, for the source, remote_control.
@@ -72,10 +71,10 @@ def stop(
     *,
     source: options.SourceOption = None,
     as_json: _JsonOption = False,
-    lcm: _LcmOption = False,
+    lcm: options.LcmOption = False,
     query: options.QueryOptions,
 ) -> None:
-    """Stop the running take.
+    """Stop the running take, and print how long it is.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else, also a take that lacks messages.
     """
@@ -99,7 +98,7 @@ def save(
     details: options.DetailsOptions,
     source: options.SourceOption = None,
     as_json: _JsonOption = False,
-    lcm: _LcmOption = False,
+    lcm: options.LcmOption = False,
     query: options.QueryOptions,
 ) -> None:
     """Keep the last seconds as a take. Needs takes.keep_last_s and, for the source, remote_control.
@@ -170,10 +169,10 @@ def list_(
     *,
     source: options.SourceOption = None,
     as_json: _JsonOption = False,
-    lcm: _LcmOption = False,
+    lcm: options.LcmOption = False,
     query: options.QueryOptions,
 ) -> None:
-    """List the takes of running gateways.
+    """List the takes of running gateways: when, how long, how large, what they lack and are about.
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """

@@ -45,7 +45,7 @@ def top(
             "--complete", help="Fill gaps from the gateway's history; show what was refilled and stays lost."
         ),
     ] = False,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Receive on LCM; the default is Zenoh.")] = False,
+    lcm: options.LcmOption = False,
     where: options.AddressOptions,
 ) -> None:
     """Watch what gateways publish: rates, gaps, latencies, visibility, clocks, drops, outputs, queries.

@@ -50,7 +50,7 @@ def view(
     ] = None,
     *,
     source: options.SourcesOption = None,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
+    lcm: options.LcmOption = False,
     where: options.AddressOptions,
     complete: Annotated[
         bool,

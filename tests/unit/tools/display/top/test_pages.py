@@ -249,7 +249,7 @@ COMPONENT_FIELDS = [
     *("gateway_to_here_p50_ms", "gateway_to_here_p99_ms", "num_items", "num_visible", "age_s", "is_stopped"),
     *("num_skipped", "num_malformed"),
 ]
-"""What docs/reference/commands.md promises, in this order."""
+"""What docs/reference/command-json.md promises, in this order."""
 
 
 def test_everything_about_a_source_is_json() -> None:
