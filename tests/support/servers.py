@@ -101,14 +101,15 @@ class Client:
 class ScriptedServer:
     """Runs ``script`` for every connection; listens on a free port if ``port`` is 0."""
 
-    def __init__(self, script: Script, port: int = 0) -> None:
+    def __init__(self, script: Script, port: int = 0, host: str = "127.0.0.1") -> None:
         self._script = script
+        self._host = host
         self.port = port
         self.connections = 0
         self._scripts: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
 
     async def __aenter__(self) -> Self:
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+        self._server = await asyncio.start_server(self._serve, self._host, self.port)
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -15,7 +15,7 @@ from gateway.errors import ConfigError
 from gateway.rtc3d.packets import FIRST_PRINCIPLES_PORT
 from gateway.runtime.log_format import LogFormat, LogLevel, set_up_log
 from gateway.runtime.quantities import counted
-from gateway.runtime.safe_text import safe_lines
+from gateway.runtime.safe_text import safe_lines, safe_text
 from gateway.tools.cli import options
 from gateway.tools.cli.main import print_json
 
@@ -81,14 +81,25 @@ def schema() -> None:
     print(schema_text(settings_type()), end="")
 
 
+_WATCH_S: Final = 3.0
+
+
 @options.with_options
 def doctor(
     config: options.ConfigOption = None,
     server: options.ServerOption = None,
+    find: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOSTS",
+            help="Look for RT servers on these hosts: names, addresses, or a subnet such as 192.0.2.0/24, "
+            "separated by commas.",
+        ),
+    ] = None,
     seconds: Annotated[
         float,
         typer.Option(min=0.1, max=3600, help="How many seconds to watch each source and to wait for Zenoh."),
-    ] = 3.0,
+    ] = _WATCH_S,
     no_connect: Annotated[
         bool,
         typer.Option(
@@ -128,7 +139,13 @@ def doctor(
     Without options, it uses the configuration of the installed service. With --subscriber, it checks what
     reaches this computer from gateways and by which routers; --connect and the like say where they are.
     With --exposure, the exit status is 1 if others can control recordings or takes without a password.
+    With --find, it is 1 if no RT server answers; only --json and --verbose go with it.
     """
+    if find is not None:
+        others = (config, server, no_connect, subscriber, exposure, view, source, lcm, quiet)
+        is_alone = not any(others) and seconds == _WATCH_S and where == options.AddressOptions()
+        _find_servers(find, is_alone=is_alone, as_json=as_json, verbose=verbose)
+        return
     options.check_exists("--zenoh-config", where.zenoh_config)
     where.check(lcm=lcm)
     if subscriber and (config or server or no_connect):
@@ -162,6 +179,31 @@ def doctor(
     if as_json:
         print(to_json())
     if not report.is_ok:
+        raise typer.Exit(1)
+
+
+def _find_servers(hosts: str, *, is_alone: bool, as_json: bool, verbose: bool) -> None:
+    """Search for RT servers on ``hosts``, and print what was found. Exit status 1 if there is none."""
+    if not is_alone:
+        raise typer.BadParameter("--find can be combined with --json and --verbose only")
+    import uvloop
+
+    from gateway.tools.cli.take import progress_bar
+    from gateway.tools.doctor.search import parse_hosts, result_json, result_lines, search
+
+    try:
+        names = parse_hosts(hosts)
+    except ConfigError as error:
+        raise typer.BadParameter(f"--find: {error}") from None
+    set_up_log(LogLevel.DEBUG if verbose else LogLevel.ERROR, LogFormat.TEXT)
+    with progress_bar(quiet=False, counts_bytes=False) as show:
+        result = uvloop.run(search(names, show))
+    if as_json:
+        print_json(result_json(result))
+    else:
+        for line in result_lines(result):
+            print(safe_text(line))
+    if not result.is_ok:
         raise typer.Exit(1)
 
 

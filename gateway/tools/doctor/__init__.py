@@ -6,6 +6,7 @@
 
 - ``source_checks``: one server, from its name to its frames. It connects as the gateway does and listens for
   some seconds: ``observation`` collects what arrives, ``frame_checks`` judges it.
+- ``search``: the servers on hosts that the user names, if their addresses are not known.
 - ``exposure``: every port of a configuration, by what the outputs say of their ports and ``reach`` of who can
   reach them.
 - The checks of an output are in its own package (``checks``, or ``output``).

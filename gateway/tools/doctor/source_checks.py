@@ -41,6 +41,7 @@ CHECKS: Final = (
 CONNECTION: Final = "connection"
 """The check that announces a second connection to a server."""
 
+USUAL_PORTS: Final = (FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT)
 _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
 
 
@@ -164,7 +165,7 @@ class SourceChecks:
     async def _other_ports(self) -> str:
         """Return a sentence about the usual ports that accept a connection, because this one refuses."""
         open_ports = []
-        for port in (FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT):
+        for port in USUAL_PORTS:
             if port != self._source.port:
                 with contextlib.suppress(ConnectError):
                     other = self._source.model_copy(update={"port": port})
