@@ -67,8 +67,8 @@ def test_searching_in_the_network_would_be_seen(scouts: socket.socket) -> None:
         assert scouts.recv(1)
 
 
-@pytest.mark.parametrize(("page", "count"), [("tutorial", 9), ("how-to/view", 3)])
-def test_every_command_of_the_tutorial_and_of_the_view_prints_the_output_on_the_page(
+@pytest.mark.parametrize(("page", "count"), [("tutorial", 9), ("how-to/view", 3), ("how-to/first-hour", 7)])
+def test_every_command_of_pages_that_search_by_multicast_prints_the_output_on_the_page(
     page: str, count: int, folder: Path, terminals: dict[str, Terminal]
 ) -> None:
     assert follow(f"docs/{page}.md", folder, terminals) >= count
