@@ -120,7 +120,7 @@ def run_nginx(folder: Path, servers: Servers, *changes: Change) -> Iterator[Prox
         ),
         *((f"    listen [::]:{shipped} ssl;\n", "") for shipped in (8443, 8766, 9465)),
         ("server_name capture.lab", f"server_name {NAME}"),
-        ("/etc/nginx/rtc3d-gateway", str(certificates)),
+        ("/etc/nginx/rtc3d-gateway", certificates.name),  # relative: the folder may have a space
         *changes,
     )
     (folder / "rtc3d-gateway.conf").write_text(text)

@@ -54,4 +54,5 @@ def files_in(folder: Path) -> set[str]:
 
 def pip_environment(wheelhouse: Path = WHEELHOUSE) -> dict[str, str]:
     """Return the environment variables with which pip and pipx install without a network."""
-    return {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheelhouse)}
+    # As a URL, because pip takes a variable apart at spaces.
+    return {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": wheelhouse.as_uri()}
