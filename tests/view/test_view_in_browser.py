@@ -1,5 +1,6 @@
 """``rtc3d-gateway view`` in a real browser, fed by scenes that the tests choose."""
 
+import itertools
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -27,8 +28,10 @@ LEFT: Final = (-500.0, 0.0, 200.0)
 RIGHT: Final = (500.0, 0.0, 200.0)
 TOP: Final = (0.0, 0.0, 1200.0)
 FREE: Final = (0.0, 0.0, 700.0)
+BETWEEN: Final = (0.0, 0.0, 950.0)
 
 MARKERS: Final = "/sources/MOCAP_LAB/markers"
+LINKS: Final = "/sources/MOCAP_LAB/links 0"
 LAST_PLACES: Final = "/sources/MOCAP_LAB/missing markers"
 
 
@@ -72,6 +75,12 @@ def is_blue(color: Array) -> bool:
     """Whether it is the colour of the first source."""
     red, _, blue = color
     return bool(blue - red > 100)
+
+
+def is_bluish(color: Array) -> bool:
+    """Whether a thin line in the colour of the first source covers a part of it."""
+    red, _, blue = color
+    return bool(blue - red > 40)
 
 
 def is_grey(color: Array) -> bool:
@@ -133,6 +142,26 @@ def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene,
     scene.is_sending = True
     picture.wait_for_no_text("no data")
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
+
+
+def test_a_link_joins_markers_that_move_together(scene: PublishedScene, picture: Picture) -> None:
+    steps_mm = itertools.cycle((-100.0, 0.0, 100.0))
+
+    def are_linked() -> bool:
+        step_mm = next(steps_mm)
+        scene.markers = [(x + step_mm, y, z) for x, y, z in (FREE, TOP)]
+        return any(len(node["points"]) for node in picture.shown(LINKS).values())
+
+    picture.wait_until(are_linked)
+    scene.markers = [FREE, TOP]
+    picture.wait_for_points(LINKS, [FREE, TOP])
+    picture.wait_for_drawn(MARKERS, BETWEEN, is_bluish)
+    picture.page.get_by_role("tab", name="Scene").click()
+    picture.page.get_by_label("Links").uncheck()
+    picture.wait_for_points(LINKS, [])
+    picture.wait_for_drawn(MARKERS, BETWEEN, is_background)
+    picture.page.get_by_label("Links").check()
+    picture.wait_for_points(LINKS, [FREE, TOP])
 
 
 SLOW = ("--rate", "50", "--analog-rate", "50")

@@ -5,7 +5,8 @@
 has the controls of the player.
 
 - ``scene``: the picture: the floor, the axes and the camera, and a group for each source, of ``scene_items``:
-  markers, tools and force plates.
+  markers, tools and force plates. ``links`` draws lines between markers that ``segments`` finds to belong to
+  one body segment.
 - ``panel``: what stands beside the picture: the banner, the tabs, the switches. ``texts`` says what is known
   about a source, as HTML, and ``plots`` draws channels.
 

@@ -149,6 +149,7 @@ class Switches:
             button = server.gui.add_button("Fit view", hint="Turn the camera so that it sees all data.")
             self.marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
             self.tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
+            self.links = server.gui.add_checkbox("Links", initial_value=True)
             self.trails = server.gui.add_checkbox("Marker trails", initial_value=False)
             self.floor = server.gui.add_checkbox("Floor", initial_value=True)
             self._up = server.gui.add_dropdown(

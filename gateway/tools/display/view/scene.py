@@ -14,6 +14,7 @@ from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array
 from gateway.tools.display.live import DisplayedSource, LiveComponent
+from gateway.tools.display.view.links import Links
 from gateway.tools.display.view.panel import Switches
 from gateway.tools.display.view.scene_items import (
     GREY,
@@ -138,7 +139,7 @@ _GAP_M: Final = 0.2
 
 
 class SourceScene:
-    """The markers, tools, plates and forces of a source, in a group of their own.
+    """The markers, links, tools, plates and forces of a source, in a group of their own.
 
     ``number`` is the source's: it has a colour of its own, and its labels are not where others have theirs.
     """
@@ -153,6 +154,7 @@ class SourceScene:
         self.group = scene.add_frame(path, show_axes=False)
         """What is visible if its switch is on."""
         self._markers = Markers(scene, path, color_of(number))
+        self._links = Links(scene, path, number)
         self._tools = Tools(scene, path)
         self._plates = Plates(scene, path, number)
         self._stopped = scene.add_label(
@@ -174,6 +176,8 @@ class SourceScene:
         if "3d" in components:
             labels, trails = switches.marker_labels.value, switches.trails.value
             self._markers.update(components["3d"], now_s, prefix, labels=labels, trails=trails)
+            positions, links = self._markers.positions, switches.links.value
+            self._links.update(components["3d"], positions, now_s, shown=links)
         if "6d" in components:
             self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels.value)
         self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)

@@ -47,7 +47,7 @@ Rgb = tuple[int, int, int]
 GREY: Final[Rgb] = (128, 128, 128)
 """What is not live."""
 
-_COLORS: Final[Sequence[Rgb]] = (
+COLORS: Final[Sequence[Rgb]] = (
     *((34, 139, 230), (240, 125, 20), (55, 165, 70)),
     *((150, 90, 220), (225, 60, 60), (150, 100, 60)),
 )
@@ -55,7 +55,7 @@ _COLORS: Final[Sequence[Rgb]] = (
 
 def color_of(number: int) -> Rgb:
     """Return the colour of the source with this number."""
-    return _COLORS[number % len(_COLORS)]
+    return COLORS[number % len(COLORS)]
 
 
 MAX_LABELS: Final = 300

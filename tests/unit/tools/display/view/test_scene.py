@@ -11,11 +11,13 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
 from gateway.tools.display.live import LiveComponent
+from gateway.tools.display.view.links import FIND_S, SAMPLE_US
 from gateway.tools.display.view.scene import Sphere, ViewScene
 from gateway.tools.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
+from gateway.tools.display.view.segments import MIN_FRAMES
 from gateway.tools.display.view.viewer import ViewServer
 from tests.support.errors import names
-from tests.support.takes import parameters
+from tests.support.takes import START_UTIME, parameters
 from tests.unit.tools.display.live_lab import MISSING, NAN, Lab
 
 MARKERS, TOOLS, FORCE = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.FORCE
@@ -206,6 +208,21 @@ def test_trails_follow_markers_and_are_interrupted_where_one_was_missing(picture
     picture.switch("trails", False)
     picture.show(0.1)
     assert picture.points("trails") == []
+
+
+def test_links_join_markers_that_keep_their_distance_while_they_move(picture: Picture) -> None:
+    lab = picture.lab()
+    for number in range(2 * MIN_FRAMES):
+        x = 100 * (number % 3)
+        items = [(x, 0, 0, 0), (x, 200, 0, 0), (0, 0, 900, 0)]
+        lab.send(MARKERS, items, utime=START_UTIME + number * SAMPLE_US)
+        picture.show(FIND_S)
+    lab.send(MARKERS, [(0, 0, 0, 0), (0, 200, 0, 0), (0, 0, 900, 0)])
+    picture.show()
+    assert picture.points("links 0") == [[0, 0, 0], [0, 0.2, 0]]
+    picture.switch("links", False)
+    picture.show()
+    assert picture.points("links 0") == []
 
 
 def test_tools_are_axes_with_labels_and_missing_ones_are_hidden(picture: Picture) -> None:
