@@ -81,6 +81,7 @@ class LinkFinder:
         while one of its markers is out of view.
         """
         num_known = len(self._links)
+        # A pair that occurs twice is chosen once, and then with the tolerance of a known link.
         pairs = np.concatenate([self._links, self._candidates()])
         found = self._measure(pairs)
         is_known = np.arange(len(pairs)) < num_known
@@ -97,7 +98,7 @@ class LinkFinder:
         return self._links
 
     def _candidates(self) -> Array:
-        """Return pairs that may be new links, shape (pairs, 2), after a look at a few frames."""
+        """Return pairs that may be links, shape (pairs, 2), after a look at a few frames."""
         num_frames, num_markers = min(self._num_added, NUM_FRAMES), len(self._last_mm)
         num_coarse = min(num_frames, _NUM_COARSE, _MAX_COARSE_DISTANCES // max(1, num_markers**2))
         frames = self._frames[np.linspace(0, num_frames - 1, num_coarse).astype(int)]
@@ -109,7 +110,6 @@ class LinkFinder:
         is_candidate = self._may_link & (counts[:, None] + counts >= MIN_FRAMES)
         is_candidate &= longest < MAX_LENGTH_MM + _COARSE * _TOLERANCE * MAX_LENGTH_MM
         is_candidate &= longest - shortest < _COARSE * _tolerances_mm(longest)
-        is_candidate[tuple(self._links.T)] = False
         pairs = np.argwhere(is_candidate)
         return pairs[np.argsort(abs(longest[is_candidate]))[:_MAX_PAIRS]]
 

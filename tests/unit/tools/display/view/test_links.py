@@ -8,7 +8,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.tools.display.live import DisplayedSource
 from gateway.tools.display.view.links import FIND_S, SAMPLE_US, Links
 from gateway.tools.display.view.scene_items import GREY, color_of, positions_in_metres
-from gateway.tools.display.view.segments import MIN_FRAMES
+from gateway.tools.display.view.segments import MAX_MARKERS, MIN_FRAMES
 from gateway.tools.display.view.viewer import ViewServer
 from tests.unit.tools.display.live_lab import MISSING, Lab, wait
 
@@ -153,11 +153,13 @@ def test_other_markers_do_not_inherit_links(walk: Walk) -> None:
     assert walk.show() == [line(0, 500)]
 
 
-def test_subjects_without_number_and_absurd_positions_are_harmless(walk: Walk) -> None:
-    num_subjects = 400
-    walk.lab.send_labels(*(f"S{number % 200}:M{number}" for number in range(num_subjects)))
+def test_many_subjects_and_absurd_positions_are_harmless(walk: Walk) -> None:
+    num_markers = 400
+    walk.lab.send_labels(*(f"S{number % 200}:M{number}" for number in range(num_markers)))
     for value in (0.0, 3e38, math.inf, 100.0) * MIN_FRAMES:
-        walk.send(1, *[value] * num_subjects)
+        walk.send(1, *[value] * num_markers)
         walk.show()
+    walk.send(1, *[0.0] * num_markers)
+    assert len(walk.show()) == MAX_MARKERS - 200
     assert walk.node_lines(5)
     assert walk.node_lines(6) == []

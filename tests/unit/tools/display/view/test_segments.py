@@ -213,12 +213,44 @@ def test_a_link_remains_through_a_gap_and_while_others_move(hidden: list[int]) -
     assert sorted(bodies.finder.find().tolist()) == sorted(links)
 
 
+def test_links_to_a_hidden_marker_are_not_replaced_by_longer_ones() -> None:
+    """They would be back only after seconds when the marker is in view again."""
+    frames = line(0, 100, 300, num_frames=NUM_FRAMES)
+    finder = LinkFinder("ABC")
+    for hidden in ([], [1]):
+        frames[:, hidden] = np.nan
+        for frame in frames:
+            finder.add(frame)
+        assert {*map(tuple, finder.find().tolist())} == {(0, 1), (1, 2)}
+
+
+def test_slow_motion_is_motion_too() -> None:
+    frames = line(0, 100, num_frames=20 * MIN_FRAMES)
+    frames[..., 0] -= 1.9 * STEP_MM * np.arange(len(frames))[:, None]
+    assert find("AB", frames) == {(0, 1)}
+
+
+def test_frames_in_which_only_others_move_are_no_evidence() -> None:
+    bodies = Bodies(8, 4, 4)
+    bodies.move(MIN_FRAMES - 1)
+    bodies.move(NUM_FRAMES // 2, 0)
+    links = bodies.finder.find()
+    assert set(bodies.owners[links].ravel()) == {0}
+
+
+def test_many_markers_that_are_never_in_view_do_not_displace_others() -> None:
+    bodies = Bodies(9, 40, 60)
+    bodies.hidden = [*range(40, 100)]
+    bodies.move(NUM_FRAMES)
+    assert len(bodies.finder.find()) == 39
+
+
 def test_a_segment_is_joined_by_its_shortest_distances() -> None:
     assert find("ABCDE", line(0, 400, 100, 250, 500)) == {(0, 2), (2, 3), (1, 3), (1, 4)}
 
 
 def test_markers_too_far_apart_are_linked_only_through_others() -> None:
-    far_mm = MAX_LENGTH_MM + 100
+    far_mm = MAX_LENGTH_MM + 20
     assert find("AB", line(0, far_mm)) == set()
     assert find("ABC", line(0, far_mm, far_mm / 2)) == {(0, 2), (1, 2)}
 
