@@ -3,13 +3,13 @@
 
 # Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/performance.md.
 # This takes half an hour and needs an idle machine. PARTS="ceiling loss" measures only these parts. bench-quick takes
-# two minutes, gives rough figures, and does not change the document.
+# five minutes, gives rough figures, and does not change the document.
 PARTS ?=
 
 bench: .venv/bench build/compiled/complete zenohd native-peers bench-tests ## compare with bare relays; write docs/performance.md
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
 
-bench-quick: .venv/bench build/compiled/complete native-peers bench-tests ## rough figures of `make bench` in three minutes
+bench-quick: .venv/bench build/compiled/complete native-peers bench-tests ## rough figures of `make bench` in five minutes
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
 
 # Measure two sites with a router each, and the link between them, and write benchmarks/sites/results.json and

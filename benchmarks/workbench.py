@@ -81,8 +81,9 @@ class Workbench:
                 config = processes.router_config([endpoints["router"]])
                 stack.enter_context(processes.router(folder / "router.json5", config))
             for name in self.clients:
-                self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))
-            reachable = ["router"] if self.routed else self.clients
+                if name != PLAIN_TCP:
+                    self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))
+            reachable = ["router"] if self.routed else self.programs
             mode = "client" if self.routed else "peer"
             config = zenoh_session_config(mode, connect=[endpoints[name] for name in reachable])
             urls = [self.lcm_urls[name] for name in self.programs]

@@ -11,7 +11,7 @@ import pytest
 from benchmarks import outputs
 from benchmarks.processes import NATIVE_RELAYS
 from benchmarks.subscribers import Received
-from benchmarks.workbench import GATEWAY, NATIVE, RELAY, WITHOUT_HISTORY, Workbench
+from benchmarks.workbench import GATEWAY, NATIVE, PLAIN_TCP, RELAY, WITHOUT_HISTORY, Workbench
 from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.messages.encode import CONTENT_OFFSET
 from gateway.outputs.registry import OUTPUTS
@@ -40,7 +40,7 @@ def test_the_gateway_and_the_relays_publish_the_same_number_of_messages_and_byte
     clients = [GATEWAY, WITHOUT_HISTORY, RELAY, *([NATIVE] if has_native else [])]
     zenoh, lcm = "zenoh" in names, "lcm" in names
     with Workbench(
-        DENSE, zenoh=zenoh, lcm=lcm, subscribers=[(zenoh, lcm)], reads=True, clients=clients
+        DENSE, zenoh=zenoh, lcm=lcm, subscribers=[(zenoh, lcm)], reads=True, clients=[*clients, PLAIN_TCP]
     ) as workbench:
         workbench.settle(math.inf)  # the frames sent while subscribers connected
         workbench.take_received()
