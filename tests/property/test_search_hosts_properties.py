@@ -4,7 +4,7 @@ import ipaddress
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gateway.config.section import validated
@@ -12,6 +12,7 @@ from gateway.config.values import Host
 from gateway.errors import ConfigError
 from gateway.tools.doctor.search import MAX_HOSTS, parse_hosts
 from tests.support.errors import raises
+from tests.support.examples import examples
 
 
 class Part(NamedTuple):
@@ -43,6 +44,7 @@ SUBNETS = st.one_of(
 PARTS = st.lists(ADDRESSES | NAMES | SUBNETS, min_size=1, max_size=6)
 
 
+@settings(max_examples=examples(40))
 @given(parts=PARTS, space=st.sampled_from(["", " ", "\t "]))
 @example(parts=[_subnet(0xC0000200, 24, 32), Part("a", ["a"]), Part("b", ["b"])], space="")
 @example(parts=[_subnet(0xC0000200, 24, 32), Part("a", ["a"]), Part("b", ["b"]), Part("c", ["c"])], space="")
