@@ -292,7 +292,8 @@ def ground_reactions(
     centre.
     """
     forces, moments = loads[:, :3], loads[:, 3:]
-    normal_forces = forces @ normal
+    with np.errstate(invalid="ignore"):  # loads can be infinite
+        normal_forces = forces @ normal
     has_contact = np.isfinite(loads).all(axis=1) & (abs(normal_forces) >= min_force_n) & (normal_forces != 0)
     forces, moments = (np.where(has_contact[:, None], values, 0.0) for values in (forces, moments))
     divisors = np.where(has_contact, normal_forces, 1.0)[:, None]

@@ -1,15 +1,25 @@
-"""Force plates on ROS 2: the coordinate frame of each, and where the force on it acts."""
+"""Force plates on ROS 2: units, the coordinate frame of each plate, and where the force on it acts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from gateway.messages.coordinate_frame import NO_ROTATION, CoordinateFrame
-from gateway.messages.descriptions.force_plates import PlacedPlate, force_on, placed_plates
-from gateway.messages.ros2.encode import TransformNames, pack_pose
+from gateway.messages.descriptions.force_plates import (
+    PlacedPlate,
+    force_on,
+    ground_reactions,
+    placed_plates,
+    units_of,
+)
+from gateway.messages.ros2.encode import StampedEncoder, TransformNames, pack_pose
 from gateway.messages.ros2.names import plate_name
 from gateway.rtc3d.parameters import Parameters
+
+Array: TypeAlias = npt.NDArray[Any]
 
 Transform = tuple[TransformNames, bytes]
 """As ``tf_message`` takes it."""
@@ -23,7 +33,8 @@ class PlateFrame:
     """
 
     def __init__(self, plate: PlacedPlate, frame: CoordinateFrame, frame_id: str) -> None:
-        self.frame_id = frame_id
+        self.stamped = StampedEncoder(frame_id)
+        """Encodes what is in this frame."""
         self._plate = plate
         self._frame = replace(frame, metres_per_unit=frame.scale)  # plates are in metres already
         [origin] = self._frame.points(np.array([plate.centre])).tolist()
@@ -43,10 +54,37 @@ class PlateFrame:
         [[x, y, z]] = self._frame.points(np.array([force.position])).tolist()
         return x, y, z
 
+    def centres_of_pressure(self, loads: Array) -> tuple[Array, Array]:
+        """Return in which rows of ``loads``, shape (rows, 6), there is contact, and the centres of these."""
+        plate = self._plate
+        units = np.array([plate.newtons] * 3 + [plate.newton_metres] * 3)
+        reactions = ground_reactions(loads * units, np.array(plate.normal), np.array(plate.centre))
+        has_contact = np.asarray(reactions.forces.any(axis=1))
+        return has_contact, self._frame.points(reactions.positions[has_contact])
 
-def plate_frames(parameters: Parameters, frame: CoordinateFrame, source: str) -> list[PlateFrame | None]:
-    """Return the frames of a source's plates, in their order; None for one without a known place."""
-    return [
-        None if plate is None else PlateFrame(plate, frame, f"{source}/{plate_name(number)}")
-        for number, plate in enumerate(placed_plates(parameters), start=1)
-    ]
+
+class RosPlate(NamedTuple):
+    """The units of a plate's forces and moments, in N and Nm, and its frame, if its place is known."""
+
+    newtons: float
+    newton_metres: float
+    frame: PlateFrame | None
+
+
+def ros_plates(
+    parameters: Parameters, frame: CoordinateFrame, source: str, num_plates: int
+) -> list[RosPlate]:
+    """Return the plates of a source, ``num_plates`` at least: those that are not described have N and Nm."""
+    described = parameters.force.plates if parameters.force else ()
+    plates = []
+    for number, (plate, placed) in enumerate(zip(described, placed_plates(parameters), strict=True), start=1):
+        frame_id = f"{source}/{plate_name(number)}"
+        plates.append(
+            RosPlate(*units_of(plate), None if placed is None else PlateFrame(placed, frame, frame_id))
+        )
+    return plates + [RosPlate(1.0, 1.0, None)] * (num_plates - len(plates))
+
+
+def transforms_of(plates: Sequence[RosPlate]) -> list[Transform]:
+    """Return where the plates are whose place is known."""
+    return [plate.frame.transform for plate in plates if plate.frame is not None]

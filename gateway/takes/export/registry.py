@@ -133,9 +133,8 @@ def _naming_package(
         except (GatewayError, OSError):
             raise
         except Exception as error:
-            where = traceback.extract_tb(error.__traceback__)[:2][
-                -1
-            ]  # the line of ``write``, if it is Python
+            # The line of ``write``, if it is Python.
+            where = traceback.extract_tb(error.__traceback__)[:2][-1]
             raise TakeError(
                 f"{job.out} was not written: defect in the export format {entry.name} of the package "
                 f"{package_of(entry)}: {type(error).__name__}: {error} ({where.filename}:{where.lineno}); "

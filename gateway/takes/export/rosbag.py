@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.descriptions.force_plates import units_of
 from gateway.messages.encode import metres_per_unit
 from gateway.messages.foxglove.topics import FoxgloveTopic, TopicMessages
 from gateway.messages.ros2.definitions import definition
@@ -42,7 +41,7 @@ from gateway.messages.ros2.names import (
     unique_ros_names,
     wrench_topic,
 )
-from gateway.messages.ros2.plates import PlateFrame, plate_frames
+from gateway.messages.ros2.plates import PlateFrame, RosPlate, ros_plates, transforms_of
 from gateway.messages.topics import unique_name
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
@@ -83,8 +82,7 @@ class _RosExport(SourceExport):
         self._base = f"/{DEFAULT_NAMESPACE}/{name}"
         self._stamped = StampedEncoder(self._frame.frame_id)
         self._topics: dict[tuple[str, RosType], FoxgloveTopic] = {}
-        self._frames: Sequence[PlateFrame | None] = ()
-        self._frames_of: Parameters | None = None  # those to which ``_frames`` belong
+        self._placed_by: Parameters | None = None  # those that /tf_static follows
 
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
         """Return the messages of a component; events are left out."""
@@ -146,42 +144,39 @@ class _RosExport(SourceExport):
         return [*found, tf]
 
     def _forces(self, run: Series, rows: Array) -> Iterable[TopicMessages]:
-        parameters = run.parameters_of(0)
-        plates = parameters.force.plates[: run.values.shape[1]] if parameters.force else ()
-        self.notes |= dict.fromkeys(unit_notes(plates))
-        if len(rows) and parameters is not self._frames_of:
-            yield from self._static_transforms(parameters, int(run.capture_utime[rows][0]))
-        for index in range(run.values.shape[1]):
+        parameters, num_plates = run.parameters_of(0), run.values.shape[1]
+        self.notes |= dict.fromkeys(
+            unit_notes(parameters.force.plates[:num_plates] if parameters.force else ())
+        )
+        plates = ros_plates(parameters, self._frame, self._source, num_plates)
+        if len(rows) and parameters is not self._placed_by:
+            self._placed_by = parameters
+            yield from self._static_transforms(plates, int(run.capture_utime[rows][0]))
+        for index, (newtons, newton_metres, frame) in enumerate(plates[:num_plates]):
             name = plate_name(index + 1)
-            frame = self._frames[index] if index < len(self._frames) else None
-            newtons, newton_metres = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
             values = run.values[rows, index]
             is_known = ~np.asarray(np.isnan(values).any(axis=1))
             self.count("forces with NaN", ~is_known)
             values, utimes = values[is_known], run.capture_utime[rows][is_known]
             loads = values * np.array([newtons] * 3 + [newton_metres] * 3)
             loads = self._frame.vectors(loads.reshape(-1, 2, 3)).reshape(-1, 6)
-            stamped = self._stamped if frame is None else StampedEncoder(frame.frame_id)
+            stamped = self._stamped if frame is None else frame.stamped
             encoded = stamped.encode_rows(ros_stamps(utimes), loads)
             yield self._messages(wrench_topic(name), WRENCH_STAMPED, utimes, encoded)
             if frame is not None:
                 yield self._pressure(pressure_topic(name), frame, values, utimes)
 
-    def _static_transforms(self, parameters: Parameters, utime: int) -> Iterable[TopicMessages]:
-        """Take the places of plates from new parameters, and return their frames, if they have any."""
-        self._frames_of, self._frames = parameters, plate_frames(parameters, self._frame, self._source)
-        transforms = [frame.transform for frame in self._frames if frame is not None]
-        if transforms:
+    def _static_transforms(self, plates: Sequence[RosPlate], utime: int) -> Iterable[TopicMessages]:
+        """Return where the plates are, if that is known."""
+        if transforms := transforms_of(plates):
             message = tf_message(ros_stamp(utime), transforms)
             yield TopicMessages(self._topic(TF_STATIC, TF_MESSAGE), [utime], [message])
 
     def _pressure(self, topic: str, frame: PlateFrame, loads: Array, utimes: Array) -> TopicMessages:
         """Return the centres of pressure of loads, shape (rows, 6), without those of no contact."""
-        centres = [frame.centre_of_pressure(load) for load in loads.tolist()]
-        has_contact = [centre is not None for centre in centres]
-        points = np.array([centre for centre in centres if centre is not None]).reshape(-1, 3)
+        has_contact, points = frame.centres_of_pressure(loads)
         utimes = utimes[has_contact]
-        encoded = self._stamped.encode_rows(ros_stamps(utimes), points) if len(points) else []
+        encoded = self._stamped.encode_rows(ros_stamps(utimes), points)
         return self._messages(topic, POINT_STAMPED, utimes, encoded)
 
     def _messages(self, name: str, ros_type: RosType, utimes: Array, encoded: list[bytes]) -> TopicMessages:

@@ -14,7 +14,6 @@ from typing import Final, NamedTuple, Protocol
 import zenoh
 
 from gateway.errors import OutputError, raise_unless_defect
-from gateway.messages.descriptions.force_plates import units_of
 from gateway.messages.descriptions.labels import describe
 from gateway.messages.descriptions.source_frame import unknown_unit_text
 from gateway.messages.encode import Stamp
@@ -44,7 +43,7 @@ from gateway.messages.ros2.names import (
     unique_ros_names,
     wrench_topic,
 )
-from gateway.messages.ros2.plates import PlateFrame, plate_frames
+from gateway.messages.ros2.plates import RosPlate, ros_plates, transforms_of
 from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
@@ -87,12 +86,9 @@ class _Tool(NamedTuple):
 
 
 class _Plate(NamedTuple):
+    described: RosPlate
     wrench: RosTopic
-    pressure: RosTopic | None
-    frame: PlateFrame | None  # if its place is known
-    stamped: StampedEncoder
-    newtons: float
-    newton_metres: float
+    pressure: RosTopic | None  # if its place is known
 
     @property
     def topics(self) -> list[RosTopic]:
@@ -270,8 +266,7 @@ class RosSource:
         for topic in self._former.values():
             topic.undeclare()
         self._former = {}
-        frames = [plate.frame for plate in self._plates if plate.frame is not None]
-        self._static.set_transforms(self.name, [frame.transform for frame in frames])
+        self._static.set_transforms(self.name, transforms_of([plate.described for plate in self._plates]))
 
     def _begin_with(self, parameters: ServerParameters) -> None:
         self._described_by = parameters
@@ -321,16 +316,12 @@ class RosSource:
 
     def _open_plates(self, num_plates: int) -> None:
         parsed = self._described_by.parsed
-        plates = parsed.force.plates if parsed.force else ()
-        frames = plate_frames(parsed, self._frame, self.name)
+        plates = ros_plates(parsed, self._frame, self.name, num_plates)
         names = [*map(plate_name, range(1, num_plates + 1))]
-        for index in range(len(self._plates), num_plates):
-            name, frame = names[index], frames[index] if index < len(frames) else None
+        for name, plate in [*zip(names, plates, strict=False)][len(self._plates) :]:
             wrench = self._topic(wrench_topic(name), WRENCH_STAMPED)
-            pressure = None if frame is None else self._topic(pressure_topic(name), POINT_STAMPED)
-            stamped = self._stamped if frame is None else StampedEncoder(frame.frame_id)
-            units = units_of(plates[index]) if index < len(plates) else (1.0, 1.0)
-            self._plates.append(_Plate(wrench, pressure, frame, stamped, *units))
+            pressure = None if plate.frame is None else self._topic(pressure_topic(name), POINT_STAMPED)
+            self._plates.append(_Plate(plate, wrench, pressure))
         labels = describe(ComponentType.FORCE, parsed, num_plates).labels
         self._show_names(ComponentType.FORCE, labels, names)
 
@@ -428,19 +419,19 @@ class RosSource:
         items = component.items()[: len(self._plates)]
         values = items.view(items.dtype["fx"])
         turned = self._frame.vectors(values.reshape(-1, 3)).reshape(-1, 6)
-        for plate, load, (fx, fy, fz, mx, my, mz) in zip(
+        for ((n, nm, frame), topic, pressure), load, (fx, fy, fz, mx, my, mz) in zip(
             self._plates, values.reshape(-1, 6).tolist(), turned.tolist(), strict=False
         ):
             if any(map(math.isnan, load)):
                 continue
-            if plate.wrench.wanted:
-                n, nm = plate.newtons, plate.newton_metres
+            if topic.wanted:
+                stamped = self._stamped if frame is None else frame.stamped
                 wrench = pack_wrench(fx * n, fy * n, fz * n, mx * nm, my * nm, mz * nm)
-                self._put(plate.wrench, plate.stamped.encode(stamp, wrench), now_ns)
-            if plate.pressure is not None and plate.pressure.wanted and plate.frame is not None:
-                centre = plate.frame.centre_of_pressure(load)
+                self._put(topic, stamped.encode(stamp, wrench), now_ns)
+            if frame is not None and pressure is not None and pressure.wanted:
+                centre = frame.centre_of_pressure(load)
                 if centre is not None:  # without contact, there is none
-                    self._put(plate.pressure, self._stamped.encode(stamp, pack_point(*centre)), now_ns)
+                    self._put(pressure, self._stamped.encode(stamp, pack_point(*centre)), now_ns)
 
     def _send_analog(self, topic: RosTopic, component: Component, now_ns: int) -> None:
         if self._channels.num_channels != component.num_items:

@@ -293,7 +293,7 @@ def test_the_load_on_a_plate_is_in_a_frame_at_the_centre_of_its_surface() -> Non
     assert (pressure.point.x, pressure.point.y) == pytest.approx((0.7 + 0.02, 0.6 + 0.03))
     assert source.message("force_2/wrench", "geometry_msgs/msg/WrenchStamped").header.frame_id == "hall"
     assert "/mocap/lab/force_2/centre_of_pressure" not in source.node.open
-    source.send(frame_of((FORCE, [(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), LOAD])))  # nobody stands there
+    source.send(frame_of((FORCE, [(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), LOAD])))  # 1 N is no contact
     assert (len(source.sent["force_1/wrench"]), len(source.sent["force_1/centre_of_pressure"])) == (2, 1)
 
 
