@@ -2,7 +2,6 @@
 
 import json
 import logging
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from gateway.outputs.registry import OUTPUTS, UNUSABLE, add_installed_outputs, b
 from gateway.tools.doctor.all_checks import run_checks
 from tests.support.errors import names, raises
 from tests.support.example_output import ExampleOutput, ExampleSettings
+from tests.support.installed_packages import install_package
 from tests.support.records import logged
 
 Install = Callable[..., None]
@@ -34,7 +34,7 @@ OFF = {"lcm": {"enabled": False}, "metrics": {"enabled": False}}
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a module with an entry point, as pip does: a folder with metadata beside it."""
+    """Install an output; the registry is as before in the end."""
     outputs, unusable = dict(OUTPUTS), dict(UNUSABLE)
     folder = tmp_path / "site-packages"
     monkeypatch.syspath_prepend(str(folder))
@@ -46,12 +46,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         UNUSABLE.update(unusable)
 
     def installing(module: str, name: str = "example", package: str = "rtc3d_other") -> None:
-        info = folder / f"{package}-1.2.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.2\n")
-        (info / "entry_points.txt").write_text(f"[rtc3d_gateway.outputs]\n{name} = {package}:KIND\n")
-        (folder / f"{package}.py").write_text(module)
-        sys.modules.pop(package, None)
+        install_package(folder, module, package, "rtc3d_gateway.outputs", f"{name} = {package}:KIND")
         restore()
         add_installed_outputs()
 

@@ -12,6 +12,7 @@ from gateway.takes.export.job import ExportJob, export_take
 from gateway.takes.export.registry import FORMATS, UNUSABLE, add_installed_formats
 from gateway.tools.cli.main import app
 from tests.support.errors import names, raises
+from tests.support.installed_packages import install_package
 from tests.support.takes import details, markers, write_take
 
 Install = Callable[..., None]
@@ -30,7 +31,7 @@ FORMAT = Format(write, ("3d",), keeps_details=False, lacks={"3d": "positions"})
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a module with an entry point, as pip does: a folder with metadata beside it."""
+    """Install a format; the registry is as before in the end."""
     formats = dict(FORMATS)
     folder = tmp_path / "site-packages"
     monkeypatch.syspath_prepend(str(folder))
@@ -42,12 +43,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         add_installed_formats.cache_clear()
 
     def installing(module: str, name: str = "frames", package: str = "rtc3d_frames") -> None:
-        info = folder / f"{package}-1.2.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.2\n")
-        (info / "entry_points.txt").write_text(f"[gateway.export_formats]\n{name} = {package}:FORMAT\n")
-        (folder / f"{package}.py").write_text(module)
-        monkeypatch.delitem(sys.modules, package, raising=False)
+        install_package(folder, module, package, "gateway.export_formats", f"{name} = {package}:FORMAT")
         restore()
 
     yield installing

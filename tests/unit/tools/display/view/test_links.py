@@ -54,11 +54,11 @@ class Walk:
 
     def node_lines(self, index: int) -> list[list[list[float]]]:
         node = self._server.scene.get_handle_by_name(f"/lab/links {index}")
-        return [] if node is None else node.points.tolist()  # type: ignore[attr-defined]
+        return [] if node is None else node.points.tolist()  # type: ignore[attr-defined]  # it is a node of lines
 
     def color(self, index: int) -> tuple[int, ...]:
         node = self._server.scene.get_handle_by_name(f"/lab/links {index}")
-        return tuple(node.colors.tolist())  # type: ignore[union-attr]
+        return tuple(node.colors.tolist())  # type: ignore[union-attr]  # they are an array
 
 
 def line(first_mm: float, second_mm: float) -> list[list[float]]:
