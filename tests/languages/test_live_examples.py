@@ -81,7 +81,7 @@ def test_the_page_has_the_program_as_it_is(name: str) -> None:
 @pytest.mark.parametrize("name", ENDLESS)
 def test_a_program_prints_live_data_and_ends_by_one_ctrl_c(name: str, endpoint: str) -> None:
     status, output = interrupted(run(name, endpoint), ENDLESS[name])
-    assert status == -signal.SIGINT
+    assert status == -signal.SIGINT, output
     assert output.endswith("KeyboardInterrupt\n")
 
 
