@@ -60,6 +60,8 @@ class Completion:
         """Why gaps are not filled now; "" if they are."""
         self.last_problem = ""
         """Why gaps were not filled last."""
+        self.past_problem = ""
+        """Why the past was given up; "" if it came, or may still come."""
         self.unknown: Counter[Unknown] = Counter()
         """In how many places it is not known whether messages are missing."""
         is_past = completeness.last_s is not None
@@ -328,9 +330,12 @@ class Completion:
             # of an earlier version. What has made the request shows a connection, however long none follows.
             has_arrived = self._state is CompletionState.CHECKING or self._asks_for_first
             is_nobody = code == "no-gateway" and (is_connected or has_arrived)
+            was_past = self.is_past
             is_over = not self._repeat(
                 now_s, has_helped=False, is_nobody=is_nobody, knows_end=is_nobody and is_connected
             )
+            if is_over and was_past:
+                self.past_problem = text
             if is_over and code == "no-gateway":
                 self._timing.note_nobody()
         elif code == "nothing-yet" and self._lacks_what_arrived:

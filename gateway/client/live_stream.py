@@ -105,9 +105,9 @@ class Live:
     QueryError if Zenoh does not open, OutputError if LCM does not. ``with`` closes it at the end of the
     block; otherwise, it is closed when nothing refers to it.
 
-    Frames wait from the first iteration, ``on_frame`` or ``collect`` on, which all take from the same ones.
-    If too many wait, the oldest are left out: ``num_dropped`` and the ``gap`` of the next frame count them,
-    and there is a RuntimeWarning, once.
+    Frames wait from the first iteration, ``on_frame`` or ``collect`` on, which all take from the same ones;
+    with ``last_s``, from the beginning on. If too many wait, the oldest are left out: ``num_dropped`` and the
+    ``gap`` of the next frame count them, and there is a RuntimeWarning, once.
     """
 
     def __init__(
@@ -124,7 +124,8 @@ class Live:
         """Asks the same gateways, starts, stops and saves takes: ``live.client.start_take("walk")``."""
         self._wanted = (tuple(sources), tuple(components or COMPONENTS_BY_KEY))
         self._completeness = complete or last_s is not None, last_s
-        self._reception = LiveReception(is_queueing=False)
+        # The past can come before the program iterates: it would be lost.
+        self._reception = LiveReception(is_queueing=last_s is not None)
         self._connection: _Connection | None = None
         self._is_closed = False
         self._is_slow = False
@@ -413,7 +414,7 @@ class _Connection:
             self._subscriber.tick()
             former, problems = problems, self._reception.refill_problems()
             for source, problem in sorted(problems - former):
-                logger.warning("%s: gaps are not filled: %s", safe_text(source), safe_text(problem))
+                logger.warning("%s: messages are missing: %s", safe_text(source), safe_text(problem))
             is_silent = is_silent and self._reception.first_heard_s is None
             if is_silent and time.monotonic() - start_s > _SILENCE_S:
                 is_silent = False

@@ -155,9 +155,10 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         self.refill = Refill(self, self._lock, ask, find, completeness, self.monotonic)
 
     def refill_problems(self) -> set[tuple[str, str]]:
-        """Return why gaps are not filled now, by the names of the sources."""
-        found = {(each.source.name, each.completion.problem) for each in self.all_series if each.completion}
-        return {each for each in found if each[1]}
+        """Return why gaps are not filled now, or the past did not come, with the names of the sources."""
+        completed = [(each.source.name, each.completion) for each in self.all_series if each.completion]
+        found = {(name, each.problem) for name, each in completed if each.problem}
+        return found | {(name, each.past_problem) for name, each in completed if each.past_problem}
 
     def ignore(self, *, beyond_limit: bool) -> None:
         """Count a message that is left out."""

@@ -18,7 +18,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import Take, open_take
 from tests.support.networks import free_endpoint, lcm_url
 from tests.support.queried_gateway import run_gateway, wait_until_cached
-from tests.support.waiting import wait_until_async
+from tests.support.waiting import wait_until, wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -94,7 +94,10 @@ async def test_live_data_are_those_of_the_take_that_the_gateway_records(
 async def test_a_late_joiner_gets_what_the_gateway_has_kept_and_then_the_live_data(
     where: tuple[dict[str, Any], dict[str, Any]],
 ) -> None:
-    """In order, and each message once; that some are old does not make the clocks of the hosts differ."""
+    """In order, and each message once, however late the program asks for frames.
+
+    That some are old does not make the clocks of the hosts differ.
+    """
     gateway_options, options = where
     scene = SyntheticScene(markers=2, rate_hz=100.0)
     async with (
@@ -106,6 +109,7 @@ async def test_a_late_joiner_gets_what_the_gateway_has_kept_and_then_the_live_da
 
         def receive() -> list[int]:
             with live("lab", components=["3d"], last_s=30, **options) as data:
+                wait_until(lambda: data.latest("3d") is not None)
                 frames = [frame for frame, _ in zip(data, range(150), strict=False)]
             assert frames[0].capture_time == frames[0].capture_utime / 1e6
             return [frame.sequence for frame in frames]

@@ -696,6 +696,19 @@ def test_the_last_seconds_come_before_the_first_message() -> None:
     assert network.numbers == [*range(15, 21)]
 
 
+@pytest.mark.parametrize(("code", "patience_s"), [("no-gateway", NOBODY_S), ("timeout", PATIENCE_S)])
+def test_why_the_last_seconds_are_given_up_is_known(code: str, patience_s: float) -> None:
+    network = Network(completeness=Completeness(is_complete=True, last_s=1.0))
+    network.arrives(3)
+    end_s = network.now_s + patience_s
+    while network.now_s < end_s:
+        assert not network.completion.past_problem
+        network.now_s = network.completion.due_s
+        network.completion.fail(network.completion.request(), code, "nobody", network.now_s)
+    assert network.numbers == [3]
+    assert network.completion.past_problem == "nobody"
+
+
 DISPLAY: Final = Completeness(last_s=1.0, patience_s=1.0)
 """What a display wants: the last seconds if they come at once, and then the newest messages."""
 
