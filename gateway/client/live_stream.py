@@ -396,7 +396,8 @@ class _Connection:
         self._reception = reception
         self.process = Process()
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="live-sources", daemon=True)
+        # Zenoh's threads for the replies to its queries are daemons only if this one is: see program_end.
+        self._thread = threading.Thread(target=self._run, name="live-sources", daemon=False)
         self._thread.start()
 
     def close(self) -> None:

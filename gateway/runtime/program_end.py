@@ -2,7 +2,9 @@
 
 Python waits for all threads that are not daemons before it runs atexit and weakref.finalize. Zenoh calls back
 in such threads, which end when their session is closed; so a program that does not close it would never end.
-A daemon thread that closes it may return from Zenoh during Python's shutdown, which aborts the process.
+
+A daemon thread that returns from Zenoh during Python's shutdown aborts the process: one that closes a
+session, and one in which Zenoh calls back, which is a daemon if a daemon has started it.
 """
 
 import atexit
@@ -10,8 +12,10 @@ import contextlib
 import os
 import sys
 import threading
+import time
 import traceback
 import weakref
+from collections.abc import Callable
 from concurrent.futures import thread as _thread_pools  # noqa: F401 - what it registers must run after ours
 from typing import Any, Final, Protocol, TypeVar
 
@@ -20,11 +24,14 @@ from gateway.errors import ForkError
 _ZENOH_THREAD: Final = "(pyo3-closure)"
 """How the names of the threads end in which Zenoh calls back."""
 
-_OWN_DAEMONS: Final = frozenset({"live-sources", "refill"})
-"""Threads of this package that may be in a call of Zenoh. It returns when the session is closed."""
+_OWN_THREADS: Final = frozenset({"live-sources", "refill"})
+"""Threads of this package that may be in a call of Zenoh. They end when the session is closed."""
 
 _JOIN_S: Final = 20.0
 """How long to wait for these threads on a busy computer: one that is still in Zenoh aborts the process."""
+
+_JOIN_FOREIGN_S: Final = 1.0
+"""How long to wait for daemons in which Zenoh calls back: the session of some may not be closed here."""
 
 
 class _Closable(Protocol):
@@ -79,9 +86,8 @@ class _OpenObjects:
         if not _has_raised():
             self._join_others()
         self.close()
-        for thread in threading.enumerate():
-            if thread.name in _OWN_DAEMONS:
-                thread.join(_JOIN_S)
+        _join(lambda thread: thread.name in _OWN_THREADS, _JOIN_S)
+        _join(lambda thread: thread.daemon and thread.name.endswith(_ZENOH_THREAD), _JOIN_FOREIGN_S)
 
     def _join_others(self) -> None:
         """Wait for the threads that Python waits for: the program has not ended before."""
@@ -90,7 +96,8 @@ class _OpenObjects:
             thread
             for thread in threading.enumerate()
             if thread.is_alive()  # not if Ctrl-C has interrupted its join: Python takes it as stopped
-            and not (thread.daemon or thread in mine or thread.name.endswith(_ZENOH_THREAD))
+            and not (thread.daemon or thread in mine)
+            and not (thread.name in _OWN_THREADS or thread.name.endswith(_ZENOH_THREAD))
         ]:
             for thread in others:
                 thread.join()
@@ -100,6 +107,13 @@ class _OpenObjects:
         self._lock = threading.Lock()
         self._opened = []
         self._closer = None
+
+
+def _join(is_wanted: Callable[[threading.Thread], bool], limit_s: float) -> None:
+    """Wait for the wanted threads, no longer than this in all."""
+    end_s = time.monotonic() + limit_s
+    for thread in filter(is_wanted, threading.enumerate()):
+        thread.join(max(0.0, end_s - time.monotonic()))
 
 
 def _has_raised() -> bool:
