@@ -13,6 +13,7 @@ endpoint = sys.argv[1] if len(sys.argv) > 1 else None  # None: find gateways by 
 figure, axes = plt.subplots()
 [line] = axes.plot([], [])
 axes.set_xlabel("s since the first message")
+plt.pause(0.01)  # shows the window
 seconds, loads = np.empty(0), np.empty(0)
 with live("lab", components=["force"], connect=endpoint) as data:
     while plt.fignum_exists(figure.number):
