@@ -210,7 +210,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]
     """Where a gateway with the source lab publishes: on Zenoh and on LCM."""
     folder = tmp_path_factory.mktemp("gateway")
     places = {"zenoh": free_endpoint(), "lcm": lcm_url()}
-    with simulator("--markers", "2", "--rate", "50") as (port, _):
+    with simulator("--markers", "2", "--rate", "10", "--analog-rate", "10") as (port, _):
         settings = {
             "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
             "zenoh": {"config": zenoh_keys("peer", listen=places["zenoh"])},
@@ -523,7 +523,7 @@ def test_the_end_of_a_fork_closes_nothing_of_its_parent(
         if (child := os.fork()) == 0:
             sys.exit(5)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 5
-        for _, frame in zip(range(100), data):
+        for _, frame in zip(range(20), data):
             pass
         ready()
     """
