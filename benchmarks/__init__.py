@@ -1,1 +1,1 @@
-"""Comparisons of the gateway with bare Zenoh, LCM and TCP: `make bench`, docs/performance.md."""
+"""Comparisons of the gateway with bare Zenoh, LCM and TCP: `make bench`, docs/dev/performance.md."""

@@ -1,23 +1,23 @@
 # The benchmarks, and the programs that they compare the gateway with.
 .PHONY: bench bench-quick bench-tests bench-sites bench-sites-quick native-peers zenohd
 
-# Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/performance.md.
+# Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/dev/performance.md.
 # This takes half an hour and needs an idle machine. PARTS="ceiling loss" measures only these parts. bench-quick takes
 # five minutes, gives rough figures, and does not change the document.
 PARTS ?=
 
-bench: .venv/bench build/compiled/complete zenohd native-peers bench-tests ## compare with bare relays; write docs/performance.md
+bench: .venv/bench build/compiled/complete zenohd native-peers bench-tests ## compare with bare relays; write docs/dev/performance.md
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
 
 bench-quick: .venv/bench build/compiled/complete native-peers bench-tests ## rough figures of `make bench` in five minutes
 	$(COMPILED) tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
 
 # Measure two sites with a router each, and the link between them, and write benchmarks/sites/results.json and
-# docs/scale.md. This takes half an hour and needs an idle machine, ip, tc and nsenter (Debian: iproute2, util-linux).
+# docs/dev/scale.md. This takes half an hour and needs an idle machine, ip, tc and nsenter (Debian: iproute2, util-linux).
 # PARTS as above. bench-sites-quick takes three minutes and does not change the document.
 SITES := $(COMPILED) tests/with-netns $(BIN)/python -m benchmarks.sites
 
-bench-sites: .venv/bench build/compiled/complete zenohd bench-tests native-peers ## measure two sites and their link; write docs/scale.md
+bench-sites: .venv/bench build/compiled/complete zenohd bench-tests native-peers ## measure two sites and their link; write docs/dev/scale.md
 	$(SITES) $(PARTS)
 
 bench-sites-quick: .venv/installed build/compiled/complete native-peers ## rough figures of `make bench-sites`

@@ -10,7 +10,7 @@ from benchmarks.workbench import GATEWAY, Workbench
 from benchmarks.workloads import LAB
 
 TITLE: Final = "Scaling: the gateway's CPU time per frame, by number of subscribers"
-PLOT: Final = ROOT / "docs" / "performance.png"
+PLOT: Final = ROOT / "docs" / "dev" / "performance.png"
 GOAL: Final = 1.5
 _CONNECTIONS: Final = {
     "Zenoh, direct": (True, False),

@@ -19,7 +19,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
 
 LCM_BUFFER_BYTES: Final = 4_000_000
-"""``recv_buf_size`` of subscribers that must lose nothing; docs/performance.md explains it."""
+"""``recv_buf_size`` of subscribers that must lose nothing; docs/dev/performance.md explains it."""
 
 _QUEUE_MESSAGES: Final = 100_000
 _CONTENT: Final = struct.Struct(">iq")  # frame number and time stamp, after the prefix of every message

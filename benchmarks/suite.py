@@ -66,14 +66,14 @@ GATEWAY: Final = Suite(
         "replay",
         "history",
     ),
-    (ROOT / "docs" / "performance.md",),
+    (ROOT / "docs" / "dev" / "performance.md",),
 )
 """What the gateway costs in addition to Zenoh and LCM."""
 
 SITES: Final = Suite(
     "benchmarks.sites",
     ("fan_out", "slow_link", "faults", "gateways", "display"),
-    (ROOT / "docs" / "scale.md", ROOT / "docs" / "reliability.md"),
+    (ROOT / "docs" / "dev" / "scale.md", ROOT / "docs" / "dev" / "reliability.md"),
 )
 """Two sites, each with a router, and the link between them."""
 

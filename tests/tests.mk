@@ -103,7 +103,7 @@ fuzz: .venv/installed ## coverage-guided fuzzing, and more examples of hypothesi
 SOAK_MINUTES ?= 30
 
 soak: build/compiled/complete ## random faults and attacks for SOAK_MINUTES
-	$(COMPILED) tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
+	$(COMPILED) tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/dev/reliability.md
 
 # Stop a gateway under load STOPS times; every stop must end with status 0 within 2 s. Not part of the check.
 STOPS ?= 500

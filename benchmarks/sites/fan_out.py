@@ -17,7 +17,7 @@ from benchmarks.workloads import DENSE, LAB, Paced, Sent, Workload, send
 TITLE: Final = "Subscribers on two sites"
 RATE_HZ: Final = 200
 WORKLOADS: Final = {"lab": LAB, "dense": DENSE}
-PLOT: Final = ROOT / "docs" / "scale.svg"
+PLOT: Final = ROOT / "docs" / "dev" / "scale.svg"
 GOAL_CPU: Final = 1.5
 _COMPONENTS: Final = 5
 _FIRST_FRAMES: Final = 20

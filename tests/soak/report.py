@@ -1,4 +1,4 @@
-"""The report of a run, in Markdown for docs/reliability.md."""
+"""The report of a run, in Markdown for docs/dev/reliability.md."""
 
 import platform
 import statistics
