@@ -23,6 +23,9 @@ from tests.soak.soak import (
     Usage,
 )
 
+MIN_GROWTH_MIB: Final = 50
+"""The least growth of memory for which the report lists an attack."""
+
 _NUM_USAGE_COLUMNS: Final = 6
 
 
@@ -33,9 +36,10 @@ def report(soak: Soak) -> str:
         _totals(soak),
         "What the gateway used after each part of the time, memory in MiB:",
         _usage(soak),
-        "The healthy source during each attack: its longest silence at a subscriber and its missing "
-        "messages, the lines that all sources together logged in one round at most, and the largest growth "
-        "of the gateway's memory in one round.",
+        f"The healthy source during the attacks with a silence above {_ms(MAX_SILENCE_S)} ms or with missing "
+        f"messages, or in whose rounds the gateway's memory grew by more than {MIN_GROWTH_MIB} MiB: its "
+        "longest silence at a subscriber and its missing messages, the lines that all sources together "
+        "logged in one round at most, and the largest growth of the memory in one round.",
         _attacks(soak.rounds),
         "Frames that the simulator of the disturbed source sent, and messages that a subscriber received, by "
         "component. Lost frames were in transit on connections that a fault ended, or are counted as drops "
@@ -152,6 +156,9 @@ def _attacks(rounds: Sequence[Round]) -> str:
             f"{growth_kib[attack] / 1024:.1f}",
         )
         for attack, done in sorted(by_attack.items())
+        if _silent_rounds(done)
+        or any(each.missing for each in done)
+        or growth_kib[attack] > MIN_GROWTH_MIB * 1024
     ]
     outputs = [f"silence on {output}, ms" for output in rounds[0].longest_silence_s]
     return _table(("attack", "rounds", *outputs, "missing", "lines", "growth, MiB"), rows)
