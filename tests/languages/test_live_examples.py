@@ -25,7 +25,20 @@ ENDLESS = {
     "live_control.py": "Tool 1 at ",
     "live_two_sources.py": " mm apart, ",
 }
-SIMULATED = ("--markers", "3", "--tools", "1", "--analog", "2", "--plates", "1", "--rate", "100")
+SIMULATED = (
+    "--markers",
+    "3",
+    "--tools",
+    "1",
+    "--analog",
+    "2",
+    "--plates",
+    "1",
+    "--rate",
+    "100",
+    "--analog-rate",
+    "100",
+)
 
 
 @pytest.fixture(scope="module")

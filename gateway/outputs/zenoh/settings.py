@@ -118,7 +118,7 @@ class ZenohSettings(OutputSettings):
     """How many queries a second to answer for each key, or selector with wildcards."""
 
     max_reply_bytes_per_s: ByteLimit = 16 * 1024 * 1024
-    """How many bytes a second to send in replies. Those of more than 1 MiB (C3D files) count apart."""
+    """How many bytes a second to send in replies. Those above 512 KiB, and the history's, count apart."""
 
     @property
     @override
