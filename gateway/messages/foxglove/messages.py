@@ -1,4 +1,4 @@
-"""The messages of one source as Foxglove's, one at a time: for a file, or live.
+"""The messages of one source as Foxglove's: for a file, or live.
 
 docs/reference/takes.md has the table of topics.
 """
@@ -34,7 +34,6 @@ from gateway.messages.foxglove.topics import (
     FloatTopics,
     FoxgloveMessage,
     FoxgloveTopic,
-    ProtobufRecord,
     TopicMessages,
     field_names,
     json_topic,
@@ -68,6 +67,12 @@ NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: len(_LO
 
 _MAX_LAYOUTS: Final = 100
 """How many different numbers of items of one component are remembered."""
+
+_EVENT_VALUES: Final = ("id", "param1", "param2", "param3")
+"""The fields of an event that its message is made of."""
+
+_MAX_EVENTS: Final = 100
+"""How many messages of events are remembered: the same button is pressed again and again."""
 
 _MILLIMETRE: Final = 1e-3
 
@@ -119,6 +124,7 @@ class FoxgloveSource:
         self._frame = frame
         self._plates = PlateScene(parameters, frame)
         self._labels_of = lru_cache(_MAX_LAYOUTS)(self._find_labels)
+        self._event_message = lru_cache(_MAX_EVENTS)(self._find_event_message)
         self._number_records = lru_cache(_MAX_LAYOUTS)(self._new_records)
         self._fixed = FixedTopics(
             markers=topic_of(f"/{source}/markers", PointCloud),
@@ -184,71 +190,40 @@ class FoxgloveSource:
             FoxgloveMessage(self._fixed.outlines, utime, self._plates.outlines(utime)),
         ]
 
-    def convert(
-        self,
-        component: ComponentType,
-        items: Items,
-        capture_utime: int,
-        timestamp_us: int,
-        wanted: Container[FoxgloveTopic] | None = None,
-    ) -> list[FoxgloveMessage]:
-        """Return the messages of one component, on the ``wanted`` topics; None means all.
-
-        ``items`` has the shape (items,) and the dtype of ITEM_DTYPES in any byte order. ``capture_utime`` is
-        in µs since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
-        """
-        found: list[FoxgloveMessage] = []
-        for topic in self.topics(component, len(items)):
-            if wanted is not None and topic not in wanted:
-                continue
-            if topic is self._fixed.markers:
-                [data] = self._clouds(items[np.newaxis], [capture_utime])
-                found.append(FoxgloveMessage(topic, capture_utime, data))
-            elif topic is self._fixed.tools:
-                data = self._transforms(items, capture_utime)
-                if data:
-                    found.append(FoxgloveMessage(topic, capture_utime, data))
-            elif topic is self._fixed.events:
-                found += [self._log(item, capture_utime, timestamp_us) for item in items]
-            elif topic is self._fixed.arrows:
-                data = self._plates.arrows(items, capture_utime)
-                found.append(FoxgloveMessage(topic, capture_utime, data))
-            else:
-                record = self._number_records(component, len(items))[topic]
-                found.append(FoxgloveMessage(topic, capture_utime, record.encode(_floats(items))))
-        return found
-
     def convert_frames(
         self,
         component: ComponentType,
         items: Items,
         capture_utimes: list[int],
         timestamps_us: list[int],
-        arrow_interval: int,
+        arrow_interval: int = 1,
+        wanted: Container[FoxgloveTopic] | None = None,
     ) -> Iterator[TopicMessages]:
-        """Yield the messages of many frames for a file: what ``convert`` returns for each of them.
+        """Yield the messages of one component of many frames, on the ``wanted`` topics; None means all.
 
-        ``items`` has the shape (frames, items). Forces are drawn in one of ``arrow_interval`` frames only.
+        ``items`` has the shape (frames, items) and the dtype of ITEM_DTYPES in any byte order.
+        ``capture_utimes`` are in µs since 1970, from 0 to MAX_UTIME, and ``timestamps_us`` the server's time
+        stamps. Forces are drawn in one of ``arrow_interval`` frames only.
         """
-        num_items = items.shape[1]
+        num_frames, num_items = items.shape
+        frames = range(num_frames)
         records = self._number_records(component, num_items) if component in NUMBERS_PER_ITEM else {}
         for topic in self.topics(component, num_items):
+            if wanted is not None and topic not in wanted:
+                continue
             record = records.get(topic)
-            if isinstance(record, ProtobufRecord):  # as all in files
-                yield TopicMessages(topic, capture_utimes, record.encode_rows(_floats(items)))
+            if record is not None:
+                yield TopicMessages(topic, capture_utimes, record.encode_rows(_floats(items)), frames)
             elif topic is self._fixed.markers:
-                yield TopicMessages(topic, capture_utimes, self._clouds(items, capture_utimes))
+                yield TopicMessages(topic, capture_utimes, self._clouds(items, capture_utimes), frames)
+            elif topic is self._fixed.tools:
+                yield self._transforms(items, capture_utimes)
+            elif topic is self._fixed.arrows:
+                drawn = slice(None, None, arrow_interval)
+                utimes = capture_utimes[drawn]
+                yield TopicMessages(topic, utimes, self._plates.arrows(items[drawn], utimes), frames[drawn])
             else:
-                chosen = slice(None, None, arrow_interval if topic is self._fixed.arrows else 1)
-                frames = zip(items[chosen], capture_utimes[chosen], timestamps_us[chosen], strict=True)
-                converted = [
-                    message
-                    for frame, utime, timestamp_us in frames
-                    for message in self.convert(component, frame, utime, timestamp_us, (topic,))
-                ]
-                yield TopicMessages(
-                    topic, [message.utime for message in converted], [message.data for message in converted]
-                )
+                yield self._logs(items, capture_utimes, timestamps_us)
 
     def _clouds(self, items: Items, utimes: list[int]) -> list[bytes]:
         """Return the visible markers of frames; each has its position in the parameters, from 0."""
@@ -258,7 +233,12 @@ class FoxgloveSource:
             points[..., :3] = self._frame.points(values[..., :3])
         points[..., 3] = values[..., 3]
         points.view("<u4")[..., 4] = np.arange(items.shape[1])
-        is_visible: Any = np.isfinite(values[..., :3]).all(axis=2)
+        is_visible: Any = np.isfinite(values[..., :3])
+        if is_visible.all():  # as usual, which is faster
+            clouds = [frame.tobytes() for frame in points]
+        else:
+            shown = zip(points, is_visible.all(axis=2), strict=True)
+            clouds = [frame[visible].tobytes() for frame, visible in shown]
         return [
             PointCloud(
                 timestamp=timestamp(utime),
@@ -266,33 +246,38 @@ class FoxgloveSource:
                 pose=NO_POSE,
                 point_stride=_POINT.itemsize,
                 fields=_POINT_FIELDS,
-                data=frame[visible].tobytes(),
+                data=cloud,
             ).encode()
-            for frame, visible, utime in zip(points, is_visible, utimes, strict=True)
+            for cloud, utime in zip(clouds, utimes, strict=True)
         ]
 
-    def _transforms(self, items: Items, utime: int) -> bytes:
-        """Return the poses of the visible tools; b"" if there are none.
+    def _transforms(self, items: Items, utimes: list[int]) -> TopicMessages:
+        """Return the poses of the visible tools, for the frames that have any.
 
         Without a transform, rerun would reject the messages before and after this one, too.
         """
-        poses = self._frame.poses(items)
-        labels = self._labels_of(ComponentType.TOOLS, len(poses))
-        time = timestamp(utime)
-        transforms = []
-        for label, pose in zip(labels, poses, strict=True):
-            if pose is not None:
-                x, y, z, qx, qy, qz, qw, _ = pose
-                transforms.append(
-                    FrameTransform(
-                        timestamp=time,
-                        parent_frame_id=self._frame.frame_id,
-                        child_frame_id=f"{self.source}/{label}",
-                        translation=Vector3(x=x, y=y, z=z),
-                        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
-                    )
+        num_tools = items.shape[1]
+        poses = self._frame.poses(items.reshape(-1))
+        names = [f"{self.source}/{label}" for label in self._labels_of(ComponentType.TOOLS, num_tools)]
+        messages: list[bytes] = []
+        frames: list[int] = []
+        for frame, utime in enumerate(utimes):
+            time = timestamp(utime)
+            transforms = [
+                FrameTransform(
+                    timestamp=time,
+                    parent_frame_id=self._frame.frame_id,
+                    child_frame_id=name,
+                    translation=Vector3(x=pose[0], y=pose[1], z=pose[2]),
+                    rotation=Quaternion(x=pose[3], y=pose[4], z=pose[5], w=pose[6]),
                 )
-        return FrameTransforms(transforms=transforms).encode() if transforms else b""
+                for name, pose in zip(names, poses[frame * num_tools :], strict=False)
+                if pose is not None
+            ]
+            if transforms:
+                messages.append(FrameTransforms(transforms=transforms).encode())
+                frames.append(frame)
+        return TopicMessages(self._fixed.tools, [utimes[frame] for frame in frames], messages, frames)
 
     def _new_records(self, component: ComponentType, num_items: int) -> dict[FoxgloveTopic, FloatRecord]:
         """Return the topics of a component's values by their labels; {} if there are none or too many."""
@@ -304,15 +289,30 @@ class FoxgloveSource:
             name, names = "loads", field_names(labels, "load")
         return {record.topic: record for record in self._topics.records(name, names)}
 
-    def _log(self, item: Any, capture_utime: int, timestamp_us: int) -> FoxgloveMessage:
-        """Return an event, at its own time stamp if that is plausible."""
-        delay_us = timestamp_us - int(item["timestamp"])
-        utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
-        utime = min(max(utime, 0), MAX_UTIME)
-        text = event_text(self._parameters, item)
-        message = f"{text.label} ({text.description})" if text.description else text.label
-        log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)
-        return FoxgloveMessage(self._fixed.events, utime, log.encode())
+    def _logs(self, items: Items, capture_utimes: list[int], timestamps_us: list[int]) -> TopicMessages:
+        """Return the events, each at its own time stamp if that is plausible."""
+        utimes: list[int] = []
+        messages: list[bytes] = []
+        frames: list[int] = []
+        own_us = items["timestamp"].tolist()
+        values = items[[*_EVENT_VALUES]].tolist()
+        for frame, (capture_utime, timestamp_us) in enumerate(
+            zip(capture_utimes, timestamps_us, strict=True)
+        ):
+            for event_us, event in zip(own_us[frame], values[frame], strict=True):
+                delay_us = timestamp_us - event_us
+                utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
+                utime = min(max(utime, 0), MAX_UTIME)
+                time, message = timestamp(utime), self._event_message(*event)
+                log = Log(timestamp=time, level=LogLevel.Info, message=message, name=self.source)
+                utimes.append(utime)
+                messages.append(log.encode())
+                frames.append(frame)
+        return TopicMessages(self._fixed.events, utimes, messages, frames)
+
+    def _find_event_message(self, *values: int) -> str:
+        text = event_text(self._parameters, dict(zip(_EVENT_VALUES, values, strict=True)))
+        return f"{text.label} ({text.description})" if text.description else text.label
 
     def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
         return describe(component, self._parameters, num_items).labels

@@ -1,7 +1,7 @@
 """Force plates as Foxglove draws them: their outlines, and an arrow for each force."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -24,7 +24,12 @@ from foxglove.messages import (
 )
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
+from gateway.messages.descriptions.force_plates import (
+    METRES_PER_NEWTON,
+    PlateForce,
+    force_on,
+    placed_plates,
+)
 from gateway.messages.foxglove.topics import timestamp
 from gateway.rtc3d.components import Items
 from gateway.rtc3d.parameters import Parameters
@@ -86,36 +91,46 @@ class PlateScene:
         deletion = SceneEntityDeletion(timestamp=time, type=SceneEntityDeletionType.All)
         return SceneUpdate(deletions=[deletion], entities=entities).encode()
 
-    def arrows(self, items: Items, utime: int) -> bytes:
-        """Return an arrow from each centre of pressure; ``items`` are those of the Force component."""
-        time = timestamp(utime)
-        entities = [
-            # An entity without an arrow removes the one before.
-            SceneEntity(
-                timestamp=time,
-                frame_id=self._frame_id,
-                id=plate.label,
-                lifetime=_LIFETIME,
-                arrows=self._arrow(plate, load),
-            )
-            for plate, load in zip(self._plates, items.tolist(), strict=False)
-            if plate is not None
-        ]
-        return SceneUpdate(entities=entities).encode()
+    def arrows(self, items: Items, utimes: Sequence[int]) -> list[bytes]:
+        """Return the message of each frame: an arrow from each centre of pressure.
 
-    def _arrow(self, plate: PlacedPlate, load: tuple[float, ...]) -> list[ArrowPrimitive]:
-        """Return the arrow of a load; [] if it is too small or not known."""
-        found = force_on(plate, load)
-        if found is None:
-            return []
-        [[x, y, z]] = self._placed([found.position])
-        [[fx, fy, fz]] = self._frame.vectors(np.array([found.force])).tolist()
-        force = math.hypot(fx, fy, fz)
-        length = force * METRES_PER_NEWTON
-        head = min(_HEAD_M, length / 2)
-        direction = _from_x_axis(fx / force, fy / force, fz / force)
-        return [
-            ArrowPrimitive(
+        ``items`` are those of the Force component, shape (frames, plates).
+        """
+        forces = [
+            [plate and force_on(plate, load) for plate, load in zip(self._plates, loads, strict=False)]
+            for loads in items.tolist()
+        ]
+        arrows = self._arrows([force for row in forces for force in row if force is not None])
+        messages = []
+        for row, utime in zip(forces, utimes, strict=True):
+            time = timestamp(utime)
+            entities = [
+                # An entity without an arrow removes the one before.
+                SceneEntity(
+                    timestamp=time,
+                    frame_id=self._frame_id,
+                    id=plate.label,
+                    lifetime=_LIFETIME,
+                    arrows=[] if force is None else [next(arrows)],
+                )
+                for plate, force in zip(self._plates, row, strict=False)
+                if plate is not None
+            ]
+            messages.append(SceneUpdate(entities=entities).encode())
+        return messages
+
+    def _arrows(self, forces: Sequence[PlateForce]) -> Iterator[ArrowPrimitive]:
+        """Yield the arrow of each force."""
+        if not forces:
+            return
+        positions = self._placed([found.position for found in forces])
+        turned = self._frame.vectors(np.array([found.force for found in forces])).tolist()
+        for (x, y, z), (fx, fy, fz) in zip(positions, turned, strict=True):
+            force = math.hypot(fx, fy, fz)
+            length = force * METRES_PER_NEWTON
+            head = min(_HEAD_M, length / 2)
+            direction = _from_x_axis(fx / force, fy / force, fz / force)
+            yield ArrowPrimitive(
                 pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=direction),
                 shaft_length=length - head,
                 shaft_diameter=_SHAFT_M,
@@ -123,7 +138,6 @@ class PlateScene:
                 head_diameter=_HEAD_M,
                 color=_ARROW_COLOR,
             )
-        ]
 
     def _placed(self, points: Sequence[Sequence[float]]) -> list[list[float]]:
         moved: list[list[float]] = self._frame.points(np.array(points)).tolist()

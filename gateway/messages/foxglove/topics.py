@@ -49,11 +49,15 @@ class FoxgloveMessage(NamedTuple):
 
 
 class TopicMessages(NamedTuple):
-    """Messages of one topic, and the time of each in µs since 1970."""
+    """Messages of one topic, and the time of each in µs since 1970.
+
+    ``frames`` says from which frame each message is, counted from 0, if it is known.
+    """
 
     topic: FoxgloveTopic
     utimes: list[int]
     messages: list[bytes]
+    frames: Sequence[int] = ()
 
 
 class MessageClass(Protocol):
@@ -141,10 +145,10 @@ class CdrRecord:
         schema = "".join(f"float32 {name}\n" for name in names).encode()
         self.topic = FoxgloveTopic(topic_name, "cdr", schema_name, "ros2msg", schema)
 
-    def encode(self, values: Items) -> bytes:
-        """Return the message with these values, one per field, in the order of the names."""
-        data: bytes = values.astype("<f4").tobytes()
-        return _CDR_LITTLE_ENDIAN + data
+    def encode_rows(self, values: Items) -> list[bytes]:
+        """Return a message for each row of ``values``, shape (rows, fields), in the order of the names."""
+        rows = np.ascontiguousarray(values, "<f4").view(np.uint8)
+        return [_CDR_LITTLE_ENDIAN + row for row in split_rows(rows)]
 
 
 class ProtobufRecord:
@@ -167,14 +171,8 @@ class ProtobufRecord:
         self._template = np.frombuffer(bytes(data), np.uint8)
         self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
 
-    def encode(self, values: Items) -> bytes:
-        """See CdrRecord."""
-        data = self._template.copy()
-        data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
-        return data.tobytes()
-
     def encode_rows(self, values: Items) -> list[bytes]:
-        """Return a message for each row of ``values``, shape (rows, fields)."""
+        """See CdrRecord."""
         table = np.tile(self._template, (len(values), 1))
         table[:, self._places] = np.ascontiguousarray(values, "<f4")[..., np.newaxis].view(np.uint8)
         return split_rows(table)

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
-from websockets.protocol import State
+from websockets.protocol import OPEN
 
 from gateway.errors import QueryError
 from gateway.messages.decode import json_text
@@ -29,6 +29,17 @@ _MESSAGE_DATA: Final = struct.Struct("<BIQ")
 """Opcode, id of the subscription, time in ns since 1970; the message follows."""
 
 _MESSAGE_DATA_OPCODE: Final = 1
+
+_TEXT_FRAME: Final = 0x81
+_BINARY_FRAME: Final = 0x82
+"""The first byte of a frame with a whole message."""
+
+_SIZE_IN_16_BITS: Final = 126
+_SIZE_IN_64_BITS: Final = 127
+"""In place of a size from 126 bytes, which follows."""
+
+_FRAME_16: Final = struct.Struct("!BBH")
+_FRAME_64: Final = struct.Struct("!BBQ")
 _MAX_ID: Final = (1 << 32) - 1
 WARNING: Final = 1
 ERROR: Final = 2
@@ -80,6 +91,20 @@ def status(level: int, text: str) -> str:
 def message_data(subscription: int, utime: int, data: bytes) -> bytes:
     """Return a message of a channel; ``utime`` is in µs since 1970."""
     return _MESSAGE_DATA.pack(_MESSAGE_DATA_OPCODE, subscription, utime * 1000) + data
+
+
+def frame_of(message: bytes, *, is_text: bool) -> bytes:
+    """Return the frame of WebSocket with a whole message (RFC 6455, 5.2).
+
+    websockets makes the same frame, but in five times the time.
+    """
+    first = _TEXT_FRAME if is_text else _BINARY_FRAME
+    size = len(message)
+    if size < _SIZE_IN_16_BITS:
+        return b"%c%c%b" % (first, size, message)
+    if size < 1 << 16:
+        return _FRAME_16.pack(first, _SIZE_IN_16_BITS, size) + message
+    return _FRAME_64.pack(first, _SIZE_IN_64_BITS, size) + message
 
 
 def parse_request(message: str | bytes) -> tuple[list[FoxgloveSubscription], list[int]]:
@@ -239,9 +264,9 @@ class FoxgloveViewer(ServerConnection):
 
         With four viewers of all topics, a frame takes 0.3 ms instead of 0.5 ms.
         """
-        if self.protocol.state is not State.OPEN:
+        if self.protocol.state is not OPEN:
             return
-        (self.protocol.send_text if is_text else self.protocol.send_binary)(message)
+        self.protocol.writes.append(frame_of(message, is_text=is_text))
         if not self._queued_bytes:
             self.loop.call_soon(self._flush)
         self._queued_bytes += len(message)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from websockets.frames import OP_BINARY, OP_TEXT, Frame, Opcode
 
 from gateway.errors import QueryError
 from gateway.messages.foxglove.topics import FoxgloveTopic
@@ -20,6 +21,7 @@ from gateway.outputs.adapters.foxglove.connections import (
     FoxgloveViewer,
     advertise,
     channel_text,
+    frame_of,
     message_data,
     parse_request,
     server_info,
@@ -32,6 +34,15 @@ def test_message_data_is_opcode_subscription_and_nanoseconds_little_endian() -> 
     # 1; 258 = 0x0102; 1 700 000 000 000 001 µs = 1 700 000 000 000 001 000 ns = 0x17979CFE362A03E8.
     head = bytes.fromhex("01 02010000 e8032a36fe9c9717")
     assert message_data(258, 1_700_000_000_000_001, b"data") == head + b"data"
+
+
+@pytest.mark.parametrize("size", [0, 125, 126, 0xFFFF, 0x10000])
+@pytest.mark.parametrize("opcode", [OP_TEXT, OP_BINARY])
+def test_frames_are_those_of_websockets(opcode: Opcode, size: int) -> None:
+    """At each size from which the length has another form."""
+    message = bytes(size)
+    expected = Frame(opcode, message).serialize(mask=False)
+    assert frame_of(message, is_text=opcode is OP_TEXT) == expected
 
 
 def test_messages_of_the_server() -> None:

@@ -183,9 +183,9 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
     for owner, name in (
         (messages.FoxgloveSource, "_clouds"),
         (messages.FoxgloveSource, "_transforms"),
-        (topics.ProtobufRecord, "encode"),
-        (topics.CdrRecord, "encode"),
-        (messages.FoxgloveSource, "_log"),
+        (topics.ProtobufRecord, "encode_rows"),
+        (topics.CdrRecord, "encode_rows"),
+        (messages.FoxgloveSource, "_logs"),
         (plates.PlateScene, "arrows"),
     ):
         original = getattr(owner, name)
@@ -199,7 +199,7 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
     async with watching("/lab/loads", given=PLATES) as (lab, viewer):
         lab.publish(everything)
         await viewer.wait_for("/lab/loads")
-        assert converted == ["encode"]
+        assert converted == ["encode_rows"]
         viewer.unsubscribe("/lab/loads")
         await lab.wait_until_wanted(False)
         lab.publish(everything)
@@ -207,7 +207,7 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
         await lab.wait_until_wanted()
         lab.publish(everything)
         await viewer.wait_for("/lab/events")
-        assert sorted(converted) == ["_log", "arrows", "encode"]
+        assert sorted(converted) == ["_logs", "arrows", "encode_rows"]
 
 
 async def test_viewers_have_their_own_subscriptions_and_speak_one_of_two_protocols() -> None:

@@ -23,7 +23,8 @@ def messages(parameters: Parameters) -> list[FoxgloveMessage]:
     found = source.describe(UTIME)
     for component in frame.components:
         items = component.items().astype(ITEM_DTYPES[component.type])
-        found += source.convert(component.type, items, UTIME, 0)
+        for each in source.convert_frames(component.type, items[None], [UTIME], [0]):
+            found.append(FoxgloveMessage(each.topic, each.utimes[0], each.messages[0]))
     return found
 
 
