@@ -26,7 +26,7 @@ from gateway.runtime.failures import DefectLog
 from gateway.runtime.losses import Losses
 from gateway.runtime.workers import WorkerThread
 
-MIN_PAUSE_S: Final = 0.005
+MIN_PAUSE_S: Final = 0.01
 """The thread that sends pauses at least so long, so that frames at a high rate are sent several at a time."""
 
 _CLOSE_S: Final = 1.5

@@ -216,8 +216,10 @@ class _LslProcess:
                 self._outlets[number].push_chunk(values, list(times_s + self._offset_s))
             case Kind.TEXTS if number in self._outlets:
                 times, texts = json.loads(message.content)
-                for time_s, text in zip(times, texts, strict=True):
-                    self._outlets[number].push_sample([text], time_s + self._offset_s)
+                # One by one, each would wake liblsl's threads.
+                self._outlets[number].push_chunk(
+                    [[text] for text in texts], [time_s + self._offset_s for time_s in times]
+                )
 
     def _open_failed(self) -> None:
         """Open the streams that are not open yet. What fails is tried again every second."""
@@ -280,6 +282,10 @@ def _serve() -> None:
     with contextlib.suppress(AttributeError):  # only Linux has it
         # The kernel kills this process, even if it hangs, when the thread that started it ends.
         libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+    with contextlib.suppress(AttributeError, OSError):  # only Linux has it, and a sandbox may forbid it
+        # liblsl's threads, which inherit this, wake up for each sample. As batch jobs, they let the thread
+        # go on that pushes, and so find the samples of a chunk together.
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     _limit(resource.RLIMIT_DATA, MAX_MEMORY_BYTES)
     _limit(resource.RLIMIT_NOFILE, MAX_FILES)
     attributes = ctypes.create_string_buffer(256)  # glibc needs 56

@@ -3,6 +3,7 @@
 Everything here is called in the thread that sends, except where it says otherwise.
 """
 
+import functools
 import itertools
 import json
 import logging
@@ -100,6 +101,12 @@ _MAX_APART_US: Final = 1_000_000
 """Components of one frame have time stamps as near as this, or these are not those of one clock."""
 
 _ITEMS_OFFSET: Final = 16  # of the items in a component's content
+_EVENT_VALUES: Final = ("id", "param1", "param2", "param3")
+"""The fields of an event that its text is made of."""
+
+_MAX_EVENT_TEXTS: Final = 100
+"""How many texts are remembered: the same button is pressed again and again."""
+
 _POSITIONS: Final = frozenset({ComponentType.MARKERS, ComponentType.TOOLS})
 
 logger = logging.getLogger(__name__)
@@ -164,6 +171,7 @@ class SourceStreams:
         self._next_numbers = numbers
         self._send = send
         self._described = LslSource(name, computer, Parameters(), CoordinateFrame(name))
+        self._event_text = functools.lru_cache(_MAX_EVENT_TEXTS)(self._find_event_text)
         self._version = 0  # counts the parameters
         self._streams: dict[ComponentType, _OpenStream] = {}
         self._opened_s: dict[ComponentType, float] = {}  # also of streams that are closed again
@@ -172,6 +180,7 @@ class SourceStreams:
         """Open the streams that the parameters describe; close those of components without a section."""
         parsed = parameters.parsed
         self._described = LslSource(self.source, self._computer, parsed, parameters.frame)
+        self._event_text.cache_clear()
         self._version += 1
         for component in WIRE_ORDER:
             count = num_labels(component, parsed)
@@ -310,7 +319,7 @@ class SourceStreams:
             data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in together])
             shape = (len(together), component.num_items, component.item_bytes // 4)
             items = np.frombuffer(data, dtype).reshape(shape)
-            times_s = [_time_us(captured, index, suspended_us)[0] / 1e6 for captured in together]
+            times_s = [time_us / 1e6 for time_us, _ in _times_us(together, index, suspended_us)]
             values = samples(component.type, items, self._described.frame, stream.num_items)
             message = Message(Kind.SAMPLES, stream.number, samples_content(times_s, values))
             if not self._send(message):
@@ -319,32 +328,47 @@ class SourceStreams:
     def _push_events(
         self, stream: _OpenStream, frames: Sequence[CapturedFrame], index: int, suspended_us: int
     ) -> None:
-        times_s: list[float] = []
-        texts: list[str] = []
-        for captured in frames:
-            component_us, timestamp_us = _time_us(captured, index, suspended_us)
-            for item in captured.frame.component(index).items():
-                text = event_text(self._described.parameters, item)
-                texts.append(printable(f"{text.label}: {text.description}" if text.values else text.label))
-                # An event may have happened later than its component, or earlier (field note 6).
-                has_time = "timestamp" in item.dtype.names
-                delay_us = int(item["timestamp"]) - timestamp_us if has_time else 0
-                is_plausible = abs(delay_us) <= MAX_EVENT_AGE_US
-                times_s.append((component_us + (delay_us if is_plausible else 0)) / 1e6)
+        layout = frames[0].frame.layout
+        start, end = layout.content_spans[index]
+        dtype = frames[0].frame.component(index).items().dtype
+        data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in frames])
+        items = np.frombuffer(data, dtype)
+        # An event may have happened later than its component, or earlier (field note 6).
+        own_us = items["timestamp"].tolist() if "timestamp" in (dtype.names or ()) else [None] * len(items)
+        times_us = _times_us(frames, index, suspended_us)
+        of_items = (time for time in times_us for _ in range(layout.components[index].num_items))
+        times_s = []
+        for (component_us, timestamp_us), event_us in zip(of_items, own_us, strict=True):
+            delay_us = 0 if event_us is None else event_us - timestamp_us
+            is_plausible = abs(delay_us) <= MAX_EVENT_AGE_US
+            times_s.append((component_us + (delay_us if is_plausible else 0)) / 1e6)
+        texts = [self._event_text(*values) for values in items[[*_EVENT_VALUES]].tolist()]
         message = Message(Kind.TEXTS, stream.number, json.dumps((times_s, texts)).encode())
         if texts and not self._send(message):
             self._count_loss("not open", NOT_OPEN, len(frames))
+
+    def _find_event_text(self, *values: int) -> str:
+        text = event_text(self._described.parameters, dict(zip(_EVENT_VALUES, values, strict=True)))
+        return printable(f"{text.label}: {text.description}" if text.values else text.label)
 
     def _count_loss(self, cause: str, text: str, num_frames: int) -> None:
         self.losses.lost(cause, text, messages=num_frames, frames=num_frames)
 
 
-def _time_us(captured: CapturedFrame, index: int, suspended_us: int) -> tuple[int, int]:
-    """Return when a component was captured, on the monotonic clock, and its time stamp from the server."""
-    frame, layout = captured.frame, captured.frame.layout
-    _, timestamp_us = layout.unpack_number_and_timestamp(frame.body, layout.content_spans[index][0])
-    captured_us = captured.captured_us - suspended_us
-    if index:
-        apart_us = timestamp_us - frame.number_and_timestamp[1]
-        captured_us += apart_us if abs(apart_us) <= _MAX_APART_US else 0
-    return captured_us, timestamp_us
+def _times_us(frames: Sequence[CapturedFrame], index: int, suspended_us: int) -> list[tuple[int, int]]:
+    """Return when a component of each frame was captured, on the monotonic clock, and its time stamp.
+
+    All frames have one layout.
+    """
+    layout = frames[0].frame.layout
+    unpack = layout.unpack_number_and_timestamp
+    first, start = layout.content_spans[0][0], layout.content_spans[index][0]
+    found = []
+    for captured in frames:
+        body = captured.frame.body
+        _, first_us = unpack(body, first)
+        _, timestamp_us = unpack(body, start)
+        apart_us = timestamp_us - first_us
+        captured_us = captured.captured_us - suspended_us
+        found.append((captured_us + (apart_us if abs(apart_us) <= _MAX_APART_US else 0), timestamp_us))
+    return found

@@ -73,6 +73,12 @@ def problem(processes: LslProcesses) -> str:
     return processes.problem
 
 
+def test_the_threads_of_liblsl_do_not_interrupt_the_one_that_pushes(processes: LslProcesses) -> None:
+    """Otherwise each sample wakes a thread, which costs most of the time at 1000 Hz."""
+    threads = Path(f"/proc/{start(processes)}/task").iterdir()
+    assert {os.sched_getscheduler(int(each.name)) for each in threads} == {os.SCHED_BATCH}
+
+
 def test_a_process_loads_liblsl_and_ends_with_its_supervisor(processes: LslProcesses) -> None:
     assert "not started" in processes.problem
     number = start(processes)
