@@ -233,11 +233,13 @@ class FoxgloveSource:
             points[..., :3] = self._frame.points(values[..., :3])
         points[..., 3] = values[..., 3]
         points.view("<u4")[..., 4] = np.arange(items.shape[1])
-        is_visible: Any = np.isfinite(values[..., :3])
-        if is_visible.all():  # as usual, which is faster
+        is_finite: Any = np.isfinite(values[..., :3])
+        if is_finite.all():  # then there is nothing to leave out, which is faster
             clouds = [frame.tobytes() for frame in points]
         else:
-            shown = zip(points, is_visible.all(axis=2), strict=True)
+            # ``all`` over the three takes four times as long.
+            is_visible = is_finite[..., 0] & is_finite[..., 1] & is_finite[..., 2]
+            shown = zip(points, is_visible, strict=True)
             clouds = [frame[visible].tobytes() for frame, visible in shown]
         return [
             PointCloud(

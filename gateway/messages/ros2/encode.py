@@ -200,9 +200,13 @@ class StampedEncoder:
     def __init__(self, frame_id: str) -> None:
         self._frame_id = CdrWriter(_STAMP_BYTES).string(frame_id).align(8).content
 
+    def head(self, stamp: bytes) -> bytes:
+        """Return what all messages with this stamp begin with; see ``encode``."""
+        return ENCAPSULATION + stamp + self._frame_id
+
     def encode(self, stamp: bytes, content: bytes) -> bytes:
         """Return a message with the result of ``pack_pose``, ``pack_wrench`` or ``pack_point``."""
-        return b"%b%b%b%b" % (ENCAPSULATION, stamp, self._frame_id, content)
+        return self.head(stamp) + content
 
     def encode_rows(self, stamps: Array, values: Array) -> list[bytes]:
         """Return a message for each row of ``values``: points (rows, 3), wrenches (…, 6) or poses (…, 7)."""
@@ -259,7 +263,8 @@ class CloudEncoder:
             self._floats[:, :3] = positions
         is_dense = bool(np.isfinite(self._floats[:, :3]).all())
         if not is_dense:
-            self._floats[np.isnan(positions).any(axis=1), :3] = np.nan
+            is_nan = np.isnan(positions)  # ``any`` over the three takes four times as long
+            self._floats[is_nan[:, 0] | is_nan[:, 1] | is_nan[:, 2], :3] = np.nan
         self._floats[:, 3] = reliabilities
         return b"".join((ENCAPSULATION, stamp, self._layout, self._points.tobytes(), bytes([is_dense])))
 

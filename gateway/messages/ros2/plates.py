@@ -51,6 +51,10 @@ class PlateFrame:
         force = force_on(self._plate, tuple(load))
         if force is None:
             return None
+        x, y, z = force.position
+        if self._frame.only_scales:  # as usual, in a tenth of the time
+            scale = self._frame.scale
+            return x * scale, y * scale, z * scale
         [[x, y, z]] = self._frame.points(np.array([force.position])).tolist()
         return x, y, z
 

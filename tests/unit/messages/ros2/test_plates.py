@@ -10,13 +10,17 @@ from gateway.messages.descriptions.force_plates import PlacedPlate
 from gateway.messages.ros2.plates import PlateFrame
 
 PLATE = PlacedPlate("left", [], (0.5, 0.25, 0.0), (0.0, 0.0, 1.0), 1.0, 1e-3)
-FRAME = CoordinateFrame("hall", 1e-3, (0.0, 0.0, 0.6, 0.8), (1.0, 2.0, 3.0), 2.0)
+FRAMES = (
+    CoordinateFrame("hall", 1e-3, (0.0, 0.0, 0.6, 0.8), (1.0, 2.0, 3.0), 2.0),
+    CoordinateFrame("hall", 1e-3, translation_m=(1.0, 2.0, 3.0)),
+    CoordinateFrame("hall", 1e-3, scale=2.0),
+)
 LOADS = st.floats(-2000, 2000, width=32) | st.sampled_from([10.0, -10.0, 0.0, np.inf, np.nan])
 
 
-@given(arrays(np.float32, (5, 6), elements=LOADS))
-def test_rows_have_the_centres_of_single_loads(loads: np.ndarray) -> None:
-    frame = PlateFrame(PLATE, FRAME, "lab/force_1")
+@given(arrays(np.float32, (5, 6), elements=LOADS), st.sampled_from(FRAMES))
+def test_rows_have_the_centres_of_single_loads(loads: np.ndarray, source: CoordinateFrame) -> None:
+    frame = PlateFrame(PLATE, source, "lab/force_1")
     single = [frame.centre_of_pressure(load) for load in loads.tolist()]
     has_contact, centres = frame.centres_of_pressure(loads)
     assert has_contact.tolist() == [each is not None for each in single]
