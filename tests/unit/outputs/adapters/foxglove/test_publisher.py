@@ -4,16 +4,20 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import Stamp
+from gateway.outputs.adapters.foxglove import output
 from gateway.outputs.adapters.foxglove.output import FoxglovePublisher
 from gateway.outputs.adapters.foxglove.server import FoxgloveServer
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.runtime.workers import MAX_CALLS
 from tests.unit.outputs.adapters.foxglove.live import ANALOG, ITEMS, MARKERS, frame_of
 
 LAYOUTS = (frame_of({MARKERS: ITEMS[MARKERS]}), frame_of({ANALOG: ITEMS[ANALOG], MARKERS: ITEMS[MARKERS]}))
@@ -34,46 +38,83 @@ class Viewer:
         return True
 
 
+class Lab:
+    """A publisher whose thread the test stands for, and a viewer of the markers."""
+
+    def __init__(self) -> None:
+        self.calls: list[Callable[[], None]] = []
+        self.viewer = Viewer()
+        server = FoxgloveServer("127.0.0.1", 0, "1")
+        self.publisher = FoxglovePublisher("lab", server, self.calls.append)
+        self.publisher.wanted = WANTED
+        self.publisher.open()
+        self.use_parameters(0)
+        self.turn()
+        [markers] = [each for each in server._channels.values() if each.topic.name == "/lab/markers"]
+        subscriber: Any = self.viewer
+        server._subscribe(subscriber, 1, markers.number)
+
+    def use_parameters(self, version: int) -> None:
+        frame = CoordinateFrame(f"frame{version}")
+        self.publisher.set_parameters(ServerParameters(b"", 1, version, parsed=Parameters(), frame=frame))
+
+    def publish(self, utime: int, step: str = "first") -> None:
+        components = frozenset({MARKERS}) if step == "fewer" else WANTED
+        self.publisher.publish(LAYOUTS[step != "first"], Stamp(utime, utime, 1, 1), components)
+
+    def turn(self) -> None:
+        """Send what waits, without a pause."""
+        self.calls.clear()
+        self.publisher._send_waiting()
+
+
 @given(st.lists(st.sampled_from(("first", "second", "fewer", "parameters", "turn"))))
 def test_frames_are_sent_in_order_with_the_parameters_that_were_valid_when_they_came(
     schedule: list[str],
 ) -> None:
     """However many are handed over together; the thread is woken once for all of them."""
-    calls: list[Callable[[], None]] = []
-    server, viewer = FoxgloveServer("127.0.0.1", 0, "1"), Viewer()
-    publisher = FoxglovePublisher("lab", server, calls.append)
-    publisher.wanted = WANTED
+    lab = Lab()
     expected: list[tuple[int, int]] = []
     num_waiting = version = 0
-
-    def turn() -> None:
-        assert len(calls) == min(num_waiting, 1)
-        publisher._send_waiting()
-        calls.clear()
-
-    def use_parameters() -> None:
-        frame = CoordinateFrame(f"frame{version}")
-        publisher.set_parameters(ServerParameters(b"", 1, version, parsed=Parameters(), frame=frame))
-
-    publisher.open()
-    use_parameters()
-    num_waiting = 2
-    turn()
-    [markers] = [each for each in server._channels.values() if each.topic.name == "/lab/markers"]
-    subscriber: Any = viewer
-    server._subscribe(subscriber, 1, markers.number)
-    num_waiting = 0
     for utime, step in enumerate([*schedule, "turn"]):
         if step == "turn":
-            turn()
+            assert len(lab.calls) == min(num_waiting, 1)
+            lab.turn()
             num_waiting = 0
-            assert viewer.received == expected
+            assert lab.viewer.received == expected
             continue
         num_waiting += 1
         if step == "parameters":
             version += 1
-            use_parameters()
+            lab.use_parameters(version)
         else:
-            components = frozenset({MARKERS}) if step == "fewer" else WANTED
-            publisher.publish(LAYOUTS[step != "first"], Stamp(utime, utime, 1, 1), components)
+            lab.publish(utime, step)
             expected.append((utime, version))
+
+
+async def test_frames_wait_for_the_end_of_the_pause_but_not_the_first_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At a low rate, no frame is late; at a high one, a viewer costs little."""
+    lab = Lab()
+    for pause_s, num_sent in ((3600.0, 1), (3600.0, 1), (0.0, 3)):
+        monkeypatch.setattr(output, "MIN_PAUSE_S", pause_s)
+        lab.publish(1)
+        if lab.calls:
+            lab.calls.pop()()
+        if not pause_s:  # the timer's call
+            lab.publisher._send_soon()
+        assert len(lab.viewer.received) == num_sent
+
+
+def test_frames_that_find_no_place_are_refused_until_those_before_are_sent() -> None:
+    """The memory is bounded if the thread does not come round to it."""
+    lab = Lab()
+    for _ in range(2):
+        for utime in range(MAX_CALLS):
+            lab.publish(utime)
+        with pytest.raises(OutputError) as refused:
+            lab.publish(MAX_CALLS)
+        assert refused.value.cause == "queue full"
+        lab.turn()
+    assert len(lab.viewer.received) == 2 * MAX_CALLS
