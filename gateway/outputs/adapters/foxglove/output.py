@@ -135,6 +135,12 @@ MIN_PAUSE_S: Final = 0.01
 A viewer draws at most 60 pictures a second. Each frame by itself at 1000 Hz would cost three times as much.
 """
 
+_MAX_TOGETHER_BYTES: Final = 128 * 1024
+"""From how many bytes on the viewers' connections get a turn of the loop: until then, they send nothing.
+
+So a viewer that reads in time loses nothing of what has waited for a busy computer.
+"""
+
 
 class FoxglovePublisher:
     """The FramePublisher of one source: whether viewers want it, and the queue of its SourceChannels.
@@ -260,7 +266,9 @@ class FoxglovePublisher:
     def _send_waiting(self) -> None:
         """Send the frames that wait, and make the calls, in their order."""
         with self._lock:
-            entries, self._waiting, self._room = self._waiting, [], QueueRoom()
+            entries = self._take_waiting()
+            if self._waiting:
+                asyncio.get_running_loop().call_soon(self._send_waiting)
         for key, group in itertools.groupby(entries, _alike):
             together = list(group)
             if key is None:
@@ -269,6 +277,18 @@ class FoxglovePublisher:
             else:
                 self._defects.attempt(partial(self._while_open, SourceChannels.send_frames, together), None)
                 self._sent_s = time.monotonic()
+
+    def _take_waiting(self) -> list[QueuedFrame | Callable[[], None]]:
+        """Return what to send in this turn of the loop, and remove it; under the lock."""
+        num_bytes = num_taken = 0
+        while num_taken < len(self._waiting) and num_bytes < _MAX_TOGETHER_BYTES:
+            entry = self._waiting[num_taken]
+            num_taken += 1
+            if isinstance(entry, QueuedFrame):
+                self._room.free(len(entry.frame.body))
+                num_bytes += len(entry.frame.body)
+        taken, self._waiting = self._waiting[:num_taken], self._waiting[num_taken:]
+        return taken
 
 
 def _alike(entry: QueuedFrame | Callable[[], None]) -> tuple[int, frozenset[ComponentType]] | None:

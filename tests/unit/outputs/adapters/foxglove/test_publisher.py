@@ -1,5 +1,6 @@
 """The queue of frames and calls of one source, which viewers get in their order."""
 
+import asyncio
 import re
 from collections.abc import Callable
 from typing import Any
@@ -49,7 +50,8 @@ class Lab:
         self.publisher.wanted = WANTED
         self.publisher.open()
         self.use_parameters(0)
-        self.turn()
+        self.calls.clear()
+        self.publisher._send_waiting()
         [markers] = [each for each in server._channels.values() if each.topic.name == "/lab/markers"]
         subscriber: Any = self.viewer
         server._subscribe(subscriber, 1, markers.number)
@@ -62,24 +64,39 @@ class Lab:
         components = frozenset({MARKERS}) if step == "fewer" else WANTED
         self.publisher.publish(LAYOUTS[step != "first"], Stamp(utime, utime, 1, 1), components)
 
-    def turn(self) -> None:
-        """Send what waits, without a pause."""
+    def send_all(self) -> None:
+        """Send what waits, without a pause, in as many turns of the loop as that takes."""
+
+        async def turns() -> None:
+            self.publisher._send_waiting()
+            while self.publisher._waiting:  # noqa: ASYNC110 - nothing signals it
+                await asyncio.sleep(0)
+
         self.calls.clear()
-        self.publisher._send_waiting()
+        asyncio.run(turns())
 
 
-@given(st.lists(st.sampled_from(("first", "second", "fewer", "parameters", "turn"))))
+@given(
+    st.lists(st.sampled_from(("first", "second", "fewer", "parameters", "send"))),
+    st.sampled_from((1, 500, 10**6)),
+)
 def test_frames_are_sent_in_order_with_the_parameters_that_were_valid_when_they_came(
-    schedule: list[str],
+    schedule: list[str], together_bytes: int
 ) -> None:
-    """However many are handed over together; the thread is woken once for all of them."""
+    """However many are handed over or sent together; the thread is woken once for all of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(output, "_MAX_TOGETHER_BYTES", together_bytes)
+        follow(schedule)
+
+
+def follow(schedule: list[str]) -> None:
     lab = Lab()
     expected: list[tuple[int, int]] = []
     num_waiting = version = 0
-    for utime, step in enumerate([*schedule, "turn"]):
-        if step == "turn":
+    for utime, step in enumerate([*schedule, "send"]):
+        if step == "send":
             assert len(lab.calls) == min(num_waiting, 1)
-            lab.turn()
+            lab.send_all()
             num_waiting = 0
             assert lab.viewer.received == expected
             continue
@@ -116,5 +133,19 @@ def test_frames_that_find_no_place_are_refused_until_those_before_are_sent() -> 
         with pytest.raises(OutputError) as refused:
             lab.publish(MAX_CALLS)
         assert refused.value.cause == "queue full"
-        lab.turn()
+        lab.send_all()
     assert len(lab.viewer.received) == 2 * MAX_CALLS
+
+
+async def test_connections_get_a_turn_before_all_of_large_frames_are_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Otherwise, a viewer that reads in time would lose what a busy computer has delayed."""
+    lab = Lab()
+    monkeypatch.setattr(output, "_MAX_TOGETHER_BYTES", 2 * len(LAYOUTS[0].body))
+    for utime in range(5):
+        lab.publish(utime)
+    lab.calls.pop()()
+    for num_sent in (2, 4, 5):
+        assert len(lab.viewer.received) == num_sent
+        await asyncio.sleep(0)
