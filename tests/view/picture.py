@@ -1,6 +1,7 @@
 """What the page of ``view`` shows: the nodes of the scene, where they are on the screen, and pixels."""
 
 import io
+import math
 import re
 import time
 from collections.abc import Callable, Collection
@@ -90,6 +91,16 @@ class Picture:
             f"argument => ({_IS_FITTED})(({_ON_SCREEN})(argument))",
             arg=[node, [*positions]],
         )
+
+    @property
+    def camera_position(self) -> Position:
+        """Where the camera is, in metres, on the axes of three.js."""
+        x, y, z = self.page.evaluate("window.__viserMutable.camera.position.toArray()")
+        return x, y, z
+
+    def distance_to(self, position: Position) -> float:
+        """Return how far the camera is from a position, in metres."""
+        return math.dist(self.camera_position, position)
 
     def wait_until(self, condition: Callable[[], object]) -> None:
         """Wait until a condition holds, while the page goes on."""

@@ -101,6 +101,18 @@ def test_markers_are_drawn_where_they_are(scene: PublishedScene, picture: Pictur
     picture.wait_for_drawn(MARKERS, TOP, is_background)
 
 
+def test_the_key_f_fits_the_view_that_somebody_has_moved(scene: PublishedScene, picture: Picture) -> None:
+    fitted = picture.camera_position
+    picture.page.mouse.move(60, 60)  # a notice covers the middle
+    picture.page.mouse.down()
+    picture.page.mouse.move(150, 60, steps=5)
+    picture.page.mouse.up()
+    picture.wait_until(lambda: picture.distance_to(fitted) > 0.5)
+    picture.page.keyboard.press("f")
+    picture.wait_until(lambda: picture.distance_to(fitted) < 0.2)
+    picture.wait_for_view_of(MARKERS, scene.markers)
+
+
 def test_a_missing_marker_is_absent_and_its_last_place_fades(scene: PublishedScene, picture: Picture) -> None:
     picture.wait_for_drawn(MARKERS, TOP, is_blue)
     scene.is_blinking = True  # so that the last place does not fade before a slow browser shows it

@@ -146,7 +146,8 @@ class Switches:
         self._server = server
         self._tab = tab
         with tab:
-            button = server.gui.add_button("Fit view", hint="Turn the camera so that it sees all data.")
+            hint = "Move the camera so that it sees the data of the last 10 s. The key F does the same."
+            button = server.gui.add_button("Fit view (F)", hint=hint)
             self.marker_labels = server.gui.add_checkbox("Marker labels", initial_value=False)
             self.tool_labels = server.gui.add_checkbox("Tool labels", initial_value=True)
             self.links = server.gui.add_checkbox("Links", initial_value=True)
@@ -161,10 +162,12 @@ class Switches:
         self.has_chosen_up = False
         """Whether somebody has chosen the axis that points up."""
 
-        @button.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+        def fit_view(event: viser.GuiEvent[viser.GuiButtonHandle] | viser.CommandEvent) -> None:
             if event.client is not None:
                 fit(event.client)
+
+        button.on_click(fit_view)
+        server.gui.add_command("Fit view", hotkey="F").on_trigger(fit_view)
 
         @self._up.on_update
         def _(event: viser.GuiEvent[viser.GuiDropdownHandle[UpAxis]]) -> None:

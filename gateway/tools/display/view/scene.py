@@ -1,9 +1,7 @@
 """The picture: the floor, the axes and the camera, and a group for each source."""
 
-import math
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Final, NamedTuple
 from urllib.parse import quote
 
@@ -14,6 +12,13 @@ from gateway.messages.descriptions.force_plates import METRES_PER_NEWTON, UpAxis
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.files.component_rows import Array
 from gateway.tools.display.live import DisplayedSource, LiveComponent
+from gateway.tools.display.view.camera import (
+    MIN_RADIUS_M,
+    Cameras,
+    RecentPositions,
+    Subject,
+    without_outliers,
+)
 from gateway.tools.display.view.links import Links
 from gateway.tools.display.view.panel import Switches
 from gateway.tools.display.view.scene_items import (
@@ -27,14 +32,6 @@ from gateway.tools.display.view.scene_items import (
     on_floor,
 )
 
-_MIN_RADIUS_M: Final = 0.3
-_MARGIN: Final = 1.15
-_FROM: Final = (0.6, -1.0, 0.5)
-"""The direction from what is seen to the camera: on the two axes of the floor, and up."""
-
-_FAR: Final = 4.0
-"""Points that are this much farther from the middle than most others are not what the picture is about."""
-
 
 class Sphere(NamedTuple):
     """What is to be seen, in metres."""
@@ -46,32 +43,13 @@ class Sphere(NamedTuple):
 def sphere_around(parts: Sequence[Array]) -> Sphere | None:
     """Return a sphere around points, each part of shape (points, 3); None without any. NaN is left out."""
     points = np.concatenate([np.empty((0, 3)), *parts])
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
+    near = without_outliers(points[np.isfinite(points).all(axis=1)])
+    if not len(near):
         return None
-    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    near = points[distances <= _FAR * np.percentile(distances, 75) + _MIN_RADIUS_M]
     centre = (near.min(axis=0) + near.max(axis=0)) / 2
-    radius = max(_MIN_RADIUS_M, float(np.linalg.norm(near - centre, axis=1).max()))
+    radius = max(MIN_RADIUS_M, float(np.linalg.norm(near - centre, axis=1).max()))
     x, y, z = centre.tolist()
     return Sphere((x, y, z), radius)
-
-
-def fit(client: viser.ClientHandle, sphere: Sphere, up: UpAxis) -> None:
-    """Turn the camera of one browser so that it sees the sphere.
-
-    Raises ValueError if the browser has said that its camera is at no place.
-    """
-    camera = client.camera
-    aspect = camera.image_width / max(1, camera.image_height)  # the height of a page can be 0
-    angle = min(camera.fov, 2 * math.atan(math.tan(camera.fov / 2) * max(0.1, aspect)))
-    distance = _MARGIN * sphere.radius / math.sin(min(max(0.1, angle), math.pi) / 2)
-    direction = np.array(on_floor(up, *_FROM))
-    position = np.array(sphere.centre) + distance * direction / np.linalg.norm(direction)
-    with client.atomic():
-        camera.up_direction = on_floor(up, 0.0, 0.0, 1.0)
-        camera.position = position
-        camera.look_at = sphere.centre
 
 
 _AXIS_M: Final = 0.5
@@ -121,11 +99,6 @@ class World:
             grid.visible = axis == up
         self._unit.position = on_floor(up, 1.0, 0.0)
 
-    @property
-    def mark(self) -> Array:
-        """Where the mark for 1 m is, shape (1, 3)."""
-        return np.array([self._unit.position])
-
     def update(self, *, forces: bool, floor: bool) -> None:
         """Show the floor or not, and say how much force an arrow of 1 m is if there are ``forces``."""
         self._unit.text = f"1 m = {1 / METRES_PER_NEWTON:.0f} N" if forces else "1 m"
@@ -157,6 +130,8 @@ class SourceScene:
         self._links = Links(scene, path, number)
         self._tools = Tools(scene, path)
         self._plates = Plates(scene, path, number)
+        self._has_subject = False
+        self._recent = {"3d": RecentPositions(), "6d": RecentPositions()}
         self._stopped = scene.add_label(
             f"{path}/stopped", "", visible=False, font_screen_scale=1.6, anchor="bottom-center"
         )
@@ -168,10 +143,13 @@ class SourceScene:
         if source.name != self._name:  # on LCM, a status says the name
             self._name = source.name
             self._switch.label = source.name
-        self.group.visible = self._switch.value
+        self.group.visible = self.is_on
         if not self.group.visible:
             return
         components = {**source.components}
+        for key, recent in self._recent.items():
+            if key in components:
+                recent.add(components[key])
         prefix = "" if is_alone else f"{source.name}: "
         if "3d" in components:
             labels, trails = switches.marker_labels.value, switches.trails.value
@@ -194,9 +172,20 @@ class SourceScene:
         return bool(self.group.visible) and len(self._plates.corners) > 0
 
     @property
-    def points(self) -> list[np.ndarray]:
-        """The positions of everything, each of shape (points, 3), in metres; NaN is missing."""
-        return [self._markers.positions, self._tools.positions, self._plates.corners]
+    def is_on(self) -> bool:
+        """Whether its switch is on."""
+        return bool(self._switch.value)
+
+    @property
+    def has_subject(self) -> bool:
+        """Whether markers or tools have been seen, and not only plates."""
+        self._has_subject = self._has_subject or self.subject is not None
+        return self._has_subject
+
+    @property
+    def points(self) -> list[Array]:
+        """Where everything was during the last 10 s, each of shape (points, 3), in metres."""
+        return [*(recent.points for recent in self._recent.values()), self._plates.corners]
 
     def _say_stopped(self, name: str, components: dict[str, LiveComponent], up: UpAxis) -> None:
         stopped = {key: each for key, each in components.items() if each.is_stopped}
@@ -219,10 +208,6 @@ class SourceScene:
         self._stopped.position = np.add(sphere.centre, above)
 
 
-_SETTLE_S: Final = 0.3
-"""How long after the first data the view is fitted: other sources may come at the same time."""
-
-
 class ViewScene:
     """The picture of all sources. Everything is called in one thread, except what viser calls."""
 
@@ -231,15 +216,8 @@ class ViewScene:
         self._world = World(server)
         self._sources: dict[str, SourceScene] = {}  # by the beginning of their channels
         self._parameters: list[Parameters] = []
-        self._first_s: float | None = None
-        """When the first data were shown."""
-        self._has_subject = False
-        """Whether markers or tools have been shown, and not only plates."""
-        self._fitted: set[int] = set()
-        """The browsers whose view has been fitted."""
-        self._switches = Switches(
-            server, tabs.add_tab("Scene"), lambda client: self._fitted.discard(client.client_id)
-        )
+        self._cameras = Cameras()
+        self._switches = Switches(server, tabs.add_tab("Scene"), self._cameras.fit_again)
 
     def update(self, sources: list[DisplayedSource], clients: dict[int, viser.ClientHandle]) -> None:
         """Show the newest data of the sources to the browsers."""
@@ -255,40 +233,22 @@ class ViewScene:
             self._switches.suggest_up(up_axis_of(parameters))
         if self._world.up != self._switches.up:
             self._world.set_up(self._switches.up)
-            self._fitted.clear()
         for source in sources:
             self._sources[source.channels].update(
                 source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
             )
         has_plates = any(scene.has_plates for scene in self._sources.values())
         self._world.update(forces=has_plates, floor=self._switches.floor.value)
-        self._fit(clients, now_s, has_scale=has_plates)
+        shown = {
+            name: scene
+            for name, scene in self._sources.items()
+            if scene.is_on and (scene.has_subject or scene.has_plates)
+        }
+        subject = Subject(self._world.up, tuple(shown), sum(scene.has_subject for scene in shown.values()))
+        points = (part for scene in shown.values() for part in scene.points)
+        self._cameras.update(clients, subject, lambda: points, now_s)
 
     def pause(self) -> None:
         """Hide the data while no browser is connected: the next one must not show old data first."""
         for scene in self._sources.values():
             scene.group.visible = False
-
-    def _fit(self, clients: dict[int, viser.ClientHandle], now_s: float, *, has_scale: bool) -> None:
-        """Fit the view of browsers that are new, or want it; of all when the first markers or tools come."""
-        if not self._has_subject and any(scene.subject for scene in self._sources.values()):
-            self._has_subject = True
-            self._first_s = now_s
-            self._fitted.clear()
-        self._fitted &= clients.keys()
-        waiting = [client for number, client in clients.items() if number not in self._fitted]
-        if not waiting:
-            return
-        points = [part for scene in self._sources.values() if scene.group.visible for part in scene.points]
-        if points and has_scale:
-            points.append(self._world.mark)  # it says the scale of the arrows
-        sphere = sphere_around(points)
-        if sphere is None:
-            return
-        self._first_s = now_s if self._first_s is None else self._first_s
-        if now_s - self._first_s < _SETTLE_S:
-            return
-        for client in waiting:
-            self._fitted.add(client.client_id)
-            with suppress(ValueError):
-                fit(client, sphere, self._world.up)

@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,9 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, Plate, Point
 from gateway.tools.display.live import LiveComponent
+from gateway.tools.display.view.camera import Subject
 from gateway.tools.display.view.links import FIND_S, SAMPLE_US
-from gateway.tools.display.view.scene import Sphere, ViewScene
+from gateway.tools.display.view.scene import ViewScene
 from gateway.tools.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.tools.display.view.segments import MIN_FRAMES
 from gateway.tools.display.view.viewer import ViewServer
@@ -68,6 +68,10 @@ class Picture:
 
     def switch(self, name: str, value: object) -> None:
         switch = getattr(self.scene._switches, "_up" if name == "up" else name)
+        switch.value = value
+
+    def switch_source(self, value: bool, source: str = "MOCAP_LAB") -> None:
+        switch: Any = self.scene._sources[source]._switch
         switch.value = value
 
     def shown_labels(self, path: str, source: str = "MOCAP_LAB") -> dict[str, list[float]]:
@@ -292,26 +296,27 @@ def test_the_label_of_a_stop_is_above_what_has_stopped_not_in_the_middle_of_ever
     assert picture.node("stopped").position == pytest.approx((5.0, 0.0, 1.8))
 
 
-def test_the_view_is_fitted_to_plates_and_again_when_somebody_comes(
+def test_the_camera_is_fitted_to_plates_and_again_when_somebody_comes_or_a_source_is_switched(
     picture: Picture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A take, or a measurement, may begin after the page was opened."""
-    fitted: list[Sphere] = []
+    subjects: list[tuple[Subject, int]] = []
     monkeypatch.setattr(
-        "gateway.tools.display.view.scene.fit", lambda _client, sphere, _up: fitted.append(sphere)
+        picture.scene._cameras,
+        "update",
+        lambda _clients, subject, points, _now_s: subjects.append((subject, sum(map(len, points())))),
     )
-    clients: Any = {1: SimpleNamespace(client_id=1)}
     lab = picture.lab()
     picture.show_parameters(lab, PLATE)
-    for _ in range(3):
-        picture.now_s += 0.3
-        picture.scene.update([lab.source], clients)
     lab.send(MARKERS, [(5000, 0, 0, 0), (5000, 0, 1800, 0)])
-    for _ in range(3):
-        picture.now_s += 0.3
-        picture.scene.update([lab.source], clients)
-    assert [sphere.radius > 1 for sphere in fitted] == [False, True]
-    assert np.linalg.norm(np.subtract(fitted[0].centre, (1, 0, 0))) <= fitted[0].radius  # the scale is seen
+    picture.show()
+    picture.switch_source(False)
+    picture.show()
+    assert subjects == [
+        (Subject("z", ("MOCAP_LAB",), 0), 4),
+        (Subject("z", ("MOCAP_LAB",), 1), 4 + 2),
+        (Subject("z", (), 0), 0),
+    ]
 
 
 def test_the_up_axis_is_that_of_the_plates_until_somebody_chooses(picture: Picture) -> None:

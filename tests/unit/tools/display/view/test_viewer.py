@@ -81,9 +81,10 @@ def test_the_view_of_a_page_is_fitted_once_and_when_it_wants(
         with _running(viewer, lab):
             _wait_for_camera(page)
             [number] = server.get_clients()
-            assert number in viewer.scene._fitted
-            viewer.scene._fitted.discard(number)  # as its button does
-            wait_until(lambda: number in viewer.scene._fitted)
+            cameras = viewer.scene._cameras
+            assert number in cameras._pages
+            cameras.fit_again(server.get_clients()[number])  # as its button does
+            wait_until(lambda: number in cameras._pages)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_a_page_with_an_odd_camera_sees_the_data(
     with page_client(server, **camera) as page:
         wait_until(lambda: bool(server.get_clients()))
         with _running(viewer, lab):
-            wait_until(lambda: viewer.scene._fitted)
+            wait_until(lambda: viewer.scene._cameras._pages)
             page.wait_for(POINTS, "points")
 
 
