@@ -133,6 +133,15 @@ class Picture:
         """Wait until no label in the picture says this."""
         self.wait_for(f"(nodes, pattern) => !({_HAS_TEXT})(nodes, pattern)", pattern)
 
+    def wait_for_notice(self, text: str) -> None:
+        """Wait until the notice across the top of the picture begins with a text; "" is no notice."""
+        code = """text => {
+            const notice = document.querySelector('.gateway-notice');
+            if (!text) return notice.getClientRects().length === 0;
+            return notice.innerText.startsWith(text) && notice.getBoundingClientRect().top === 0;
+        }"""
+        self.page.wait_for_function(code, arg=text)
+
     def wait_for_banner(self, text: str) -> None:
         """Wait until the banner at the top of the panel contains a text."""
         self.page.wait_for_function(

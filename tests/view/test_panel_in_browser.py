@@ -137,7 +137,12 @@ def test_on_a_phone_the_panel_is_closed_until_somebody_taps_its_title(
 ) -> None:
     page = open_page(shown, new_page, viewport={"width": 390, "height": 844}, has_touch=True)
     page.wait_for_function("document.querySelector('.gateway')?.getClientRects().length === 0")
-    page.get_by_text("rtc3d-gateway").tap()
+    title = page.get_by_text("rtc3d-gateway · lab live")
+    expect(title).to_be_visible(timeout=TIMEOUT_MS)
+    box = title.bounding_box()
+    assert box is not None
+    assert box["height"] < 40  # one line
+    title.tap()
     expect(page.get_by_role("tab", name="Sources")).to_be_visible(timeout=TIMEOUT_MS)
     assert page.evaluate("document.querySelector('.gateway').clientWidth") == 390
 

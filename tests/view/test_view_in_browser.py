@@ -150,9 +150,11 @@ def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene,
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
     scene.is_sending = False
     picture.wait_for_text("^lab: no data for ")
+    picture.wait_for_notice("lab: no data since")
     picture.wait_for_drawn(MARKERS, LEFT, is_grey)
     scene.is_sending = True
     picture.wait_for_no_text("no data")
+    picture.wait_for_notice("")
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
 
 

@@ -21,15 +21,24 @@ from gateway.tools.display.view.texts import (
     html_text,
     ignored_html,
     items_html,
+    notice_text,
     source_html,
+    title_text,
 )
 
 _SCRIPT: Final = """
 if (!window.gatewayScript) {
   window.gatewayScript = true;
   document.querySelector(`[style*='width: 20em'] [style*='cursor: pointer']`)?.click();
+  const notice = document.createElement('div');
+  notice.className = 'gateway-notice';
+  document.body.append(notice);
   let second, changed = performance.now();
   setInterval(() => {
+    const canvas = window.__viserMutable?.canvas?.getBoundingClientRect();
+    if (canvas) [notice.style.left, notice.style.width] = [canvas.left + 'px', canvas.width + 'px'];
+    const text = window.__viserSceneTree?.getState()['/notice']?.message.props.text ?? '';
+    if (notice.textContent !== text) notice.textContent = text;
     const banner = document.querySelector('[data-second]'), now = performance.now();
     if (!banner) return;
     if (banner.dataset.second !== second) [second, changed] = [banner.dataset.second, now];
@@ -44,7 +53,9 @@ if (!window.gatewayScript) {
 """Runs once in each page, when the style sheet is loaded: viser offers no other way to add a script.
 
 It closes the sheet that viser shows instead of a panel on narrow screens, where it would cover the picture;
-a tap on its title opens it. Then it adds a line to the banner while this program does not change the banner.
+a tap on its title opens it. Then it shows the notice across the top of the picture, and adds a line to the
+banner while this program does not change the banner. The notice is the text of a hidden node of the scene,
+because a closed panel is not a part of the page.
 """
 
 STYLE: Final = (
@@ -80,6 +91,10 @@ STYLE: Final = (
 .gateway .events :is(td, th) { text-align: left }
 .gateway .events td:not(:first-child) { white-space: normal; overflow-wrap: anywhere }
 .gateway .frozen { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px }
+.gateway-notice { position: fixed; top: 0; z-index: 5; box-sizing: border-box; padding: 6px 12px;
+  background: var(--g-bad); color: var(--g-on-bad); font: 13px/1.4 sans-serif; text-align: center;
+  white-space: pre-line; overflow-wrap: anywhere; pointer-events: none }
+.gateway-notice:empty { display: none }
 [style*="width: 20em"] { width: 100vw !important }
 </style>"""
 )
@@ -107,14 +122,18 @@ def banner_html(
     return f"<section data-second={int(now_s)}>{''.join(lines)}</section>"
 
 
+def _state(source: DisplayedSource, is_take: bool, is_paused: bool) -> State:
+    state = data_state(source)
+    if is_take and is_paused:
+        return State(Level.WAITING, "paused")
+    if is_take and state.level is Level.GOOD:
+        return State(Level.GOOD, "recorded")
+    return state
+
+
 def _banner_line(source: DisplayedSource, now_s: float, is_take: bool, is_paused: bool) -> str:
-    name, state, last, recording = html_text(source.name), data_state(source), "", ""
-    if is_take:
-        if is_paused:
-            state = State(Level.WAITING, "paused")
-        elif state.level is Level.GOOD:
-            state = State(Level.GOOD, "recorded")
-    else:
+    name, state, last, recording = html_text(source.name), _state(source, is_take, is_paused), "", ""
+    if not is_take:
         age_s = source.age_s
         last = "" if age_s is None else f"last data {clock_text(now_s - age_s)}"
         if source.running_take and not source.is_silent:
@@ -238,6 +257,8 @@ class Panel:
         self._stopped: tuple[bool, ...] = ()
         server.gui.main_panel.set_width(_WIDTH_PX)
         server.gui.add_html(STYLE, order=-2)
+        self._title = ""
+        self._notice = server.scene.add_label("/notice", "", visible=False)
         self._banner = server.gui.add_html("", order=-1)
         with tabs.add_tab("Sources"):
             self._sources = server.gui.add_html("")
@@ -298,6 +319,12 @@ class Panel:
     def _show_banner(self, sources: Sequence[DisplayedSource]) -> None:
         banner = banner_html(sources, time.time(), is_take=self._is_take, is_paused=self._is_paused)
         _show(self._banner, [banner])
+        self._notice.text = "" if self._is_take else notice_text(sources, time.time())
+        states = [_state(each, self._is_take, self._is_paused) for each in sources]
+        title = title_text(sources, states)
+        if title != self._title:
+            self._title = title
+            self._server.gui.set_panel_label(title)
 
     def _show_sources(self, sources: Sequence[DisplayedSource]) -> None:
         shown = sources[:MAX_SHOWN_SOURCES]

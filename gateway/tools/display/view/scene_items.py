@@ -327,7 +327,8 @@ _MIN_ARROW_M: Final = 2 * _HEAD_M
 class Plates:
     """The outlines and names of plates, and arrows of the forces on them. ``path`` is the node above them.
 
-    Plates whose place is not known stand side by side at the origin. Several sources may have the same
+    When data stop, the last arrows remain, in grey. Plates whose place is not known stand side by side at the
+    origin. Several sources may have the same
     plates, so the labels of the first source, ``number`` 0, are at the centres, others towards corners.
     """
 
@@ -350,6 +351,7 @@ class Plates:
         self._names: tuple[str, ...] = ()
         self._label_places: Array = np.empty((0, 3), np.float32)
         self._head: Any = None
+        self._is_stopped = False
         self.corners: Array = np.empty((0, 3), np.float32)
         """The corners of all plates, shape (corners, 3), in metres."""
 
@@ -362,10 +364,12 @@ class Plates:
             self._known = (parameters, num_items, up)
             self._place(parameters, component, up)
         self._labels.update(self._label_places, self._names, now_s, prefix)
-        if component is None or component.is_stopped:
-            self._head = None
-            self._arrows.points = _NO_LINES
-        elif component.newest_head is not self._head:
+        is_stopped = component is not None and component.is_stopped
+        if is_stopped != self._is_stopped:
+            self._is_stopped = is_stopped
+            self._arrows.colors = np.array(GREY if is_stopped else _ARROW_COLOR, np.uint8)
+            self._outlines.colors = np.array(GREY if is_stopped else _OUTLINE_COLOR, np.uint8)
+        if component is not None and component.newest_head is not self._head:
             self._head = component.newest_head
             arrows = []
             for plate, load in zip(self._plates, component.newest_items[:MAX_PLATES].tolist(), strict=False):

@@ -96,6 +96,52 @@ def data_state(source: DisplayedSource) -> State:
     return State(Level.BAD, ", ".join(texts))
 
 
+_MAX_NOTICES: Final = 3
+
+
+def notice_text(sources: Sequence[DisplayedSource], now_s: float) -> str:
+    """Return a line for each source whose data have stopped: since when, and what the gateway knows.
+
+    ``now_s`` is the time since the Unix epoch. Nothing in the text changes from second to second.
+    """
+    lines = []
+    for source in sources:
+        if source.is_stopped:
+            since = clock_text(now_s - (_stopped_s(source) or 0.0))
+            reasons = ", ".join(each.text for each in gateway_states(source) if each.level is not Level.GOOD)
+            name = safe_text(source.name, MAX_LABEL_CHARACTERS)
+            text = f"{name}: {_stopped_text(source)} since {since}"
+            lines.append(safe_text(" · ".join(filter(None, (text, reasons))), _MAX_CHARACTERS))
+    if len(lines) > _MAX_NOTICES:
+        lines[_MAX_NOTICES:] = [f"and {counted(len(lines) - _MAX_NOTICES, 'more source')}"]
+    return "\n".join(lines)
+
+
+def title_text(sources: Sequence[DisplayedSource], states: Sequence[State]) -> str:
+    """Return the title of the panel with the worst state: on phones, it is all that a closed panel shows."""
+    if not sources:
+        return "rtc3d-gateway · no source yet"
+    levels = [*Level]
+    state, source = max(zip(states, sources, strict=True), key=lambda each: levels.index(each[0].level))
+    text = _stopped_text(source) if state.level is Level.BAD else state.text
+    others = f" (of {len(sources)} sources)" if len(sources) > 1 else ""
+    return f"rtc3d-gateway · {safe_text(source.name, MAX_LABEL_CHARACTERS)} {text}{others}"
+
+
+def _stopped_s(source: DisplayedSource) -> float | None:
+    """Return how long ago the newest data came of what has stopped; None if nothing has."""
+    ages_s = (each.age_s for each in [*source.components.values()] if each.is_stopped)
+    return min((age_s for age_s in ages_s if age_s is not None), default=None)
+
+
+def _stopped_text(source: DisplayedSource) -> str:
+    """Return which components have stopped: "no data" if all have."""
+    components = sorted([*source.components.items()])
+    known = [(key, each) for key, each in components if key != "event" and each.age_s is not None]
+    stopped = [key for key, each in known if each.is_stopped]
+    return "no data" if len(stopped) == len(known) else f"no {', '.join(stopped)}"
+
+
 def gateway_states(source: DisplayedSource) -> list[State]:
     """Return what the gateway says about each of its streams, in the words of its status line.
 

@@ -8,11 +8,15 @@ import pytest
 import viser
 
 from gateway.messages.host_time import now_utime
+from gateway.messages.source_report import Level, State
 from gateway.rtc3d.components import ComponentType
 from gateway.takes.files.component_rows import decode_rows
+from gateway.tools.display.live import DisplayedSource
 from gateway.tools.display.view import panel as view_panel
 from gateway.tools.display.view.panel import Panel
 from gateway.tools.display.view.plots import MAX_PLOTS, RecentRows
+from gateway.tools.display.view.texts import title_text
+from tests.support.statuses import stream
 from tests.support.takes import frame
 from tests.unit.tools.display.live_lab import Lab, wait
 
@@ -193,3 +197,40 @@ def test_a_plot_scrolls_on_when_data_have_stopped(
     [plot] = panel._plots._plots.values()
     times_s, lowest, _ = plot.handle.data
     assert times_s[-1] - times_s[np.isfinite(lowest)] == pytest.approx(4, abs=0.2)
+
+
+def test_the_notice_and_the_title_say_which_data_have_stopped_and_why(
+    panel: Panel, lab: Lab, show: Show, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are seen while the panel is closed, and must not change each second."""
+    lab.send_markers(True)
+    lab.send(ComponentType.ANALOG, [1.0])
+    lab.send_status(stream(state="waiting", frame_rate_hz=0.0))
+    panel.update(lab.live.update())
+    assert panel._notice.text == ""
+    assert panel._title == "rtc3d-gateway · lab live"
+    for _ in range(3):
+        show()
+    lab.send(ComponentType.ANALOG, [1.0])
+    show()
+    assert "lab: no 3d since " in panel._notice.text
+    assert panel._title == "rtc3d-gateway · lab no 3d"
+    wait(monkeypatch, 60)
+    show()
+    assert "lab: no data since " in panel._notice.text
+    assert not panel._notice.visible
+
+
+def test_a_title_names_the_worst_of_several_sources() -> None:
+    gym, lab = Lab("gym"), Lab("lab")
+    states = [State(Level.GOOD, "live"), State(Level.WAITING, "no data yet")]
+    assert (
+        title_text([source_of(gym), source_of(lab)], states)
+        == "rtc3d-gateway · lab no data yet (of 2 sources)"
+    )
+    assert title_text([], []) == "rtc3d-gateway · no source yet"
+
+
+def source_of(lab: Lab) -> DisplayedSource:
+    lab.send_markers(True)
+    return lab.source

@@ -339,8 +339,10 @@ def test_plates_without_a_known_place_stand_at_the_origin_and_say_so(picture: Pi
         f"plate {number} (place unknown)" for number in (1, 2, 3)
     }
     assert picture.points("forces") == [[0, 0, 0], [0, 0, 1]]
+    live = picture.node("forces").colors.tolist()
     picture.show(3.0)
-    assert picture.points("forces") == []
+    assert picture.points("forces") == [[0, 0, 0], [0, 0, 1]]
+    assert picture.node("forces").colors.tolist() == [128, 128, 128] != live
 
 
 @pytest.mark.parametrize("value", [1e30, -1e30, 3e38, np.inf, -np.inf, NAN])
