@@ -6,7 +6,7 @@ import socket
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
@@ -163,6 +163,7 @@ class Playback:
         self._length_us = length_us
         self._player = Player(reader, selection, live, rate=1.0, is_watched=True)
         self._has_begun = False
+        self._pages: frozenset[int] = frozenset()
         self._shown_s = 0.0
         self._moved_s = 0.0
 
@@ -184,11 +185,21 @@ class Playback:
         self._loop = gui.add_checkbox("Repeat", False)
         self._loop.on_update(lambda _event: self._repeat(self._loop.value))
 
-    def start(self) -> None:
-        """Begin to play, unless it has begun."""
-        if not self._has_begun:
+    def follow(self, pages: Iterable[int]) -> None:
+        """Play for the pages that are open now: all see the same moment.
+
+        The take begins with the first page, and from the start for one that opens while no other is open, or
+        at the end of the take. Without a page it pauses. Call it often.
+        """
+        before, self._pages = self._pages, frozenset(pages)
+        if not self._pages:
+            if before:
+                self._player.control.pause(True)
+        elif not self._has_begun:
             self._has_begun = True
             self._player.start()
+        elif not before or (self._pages - before and self._player.control.is_at_end):
+            self._play_from_start()
 
     def update(self) -> None:
         """Show the time and the state. Call it often; raises what ended the player."""
@@ -217,8 +228,7 @@ class Playback:
     def _toggle(self, _event: Any) -> None:
         control = self._player.control
         if control.is_at_end:
-            self._go_to(0)
-            control.pause(False)
+            self._play_from_start()
         else:
             control.pause(not control.is_paused)
 
@@ -226,6 +236,10 @@ class Playback:
         if event.client_id is not None:  # moved by a user, and not by `update`
             self._moved_s = time.monotonic()
             self._go_to(round(self._slider.value * 1e6))
+
+    def _play_from_start(self) -> None:
+        self._go_to(0)
+        self._player.control.pause(False)
 
     def _go_to(self, position_us: int) -> None:
         self._live.begin_again()
@@ -281,8 +295,8 @@ class Viewer:
     def update(self) -> None:
         """Decode what has arrived, and show it. Raises what ended the playback of a take."""
         clients = self._server.get_clients()
-        if clients and self._playback is not None:
-            self._playback.start()  # not before: a short take would be over
+        if self._playback is not None:
+            self._playback.follow(clients)
         is_paused = self._playback is not None and self._playback.is_paused
         if is_paused:
             self._live.hold()

@@ -25,7 +25,7 @@ class Played:
         self.live = LiveData()
         self.playback = Playback(write_take(folder / "walk.lcmlog", messages), (), self.live)
         self.playback.add_controls(gui)
-        self.playback.start()
+        self.playback.follow([1])
 
     @property
     def newest(self) -> int:
@@ -84,6 +84,33 @@ def test_a_take_begins_when_the_first_page_is_open(
     wait_until(lambda: playback._player.control.is_at_end)
     viewer.update()
     playback.close()
+
+
+def test_a_page_that_opens_later_sees_the_same_moment_as_the_others(played: Played) -> None:
+    played.drag_to(20.0)
+    wait_until(lambda: played.newest > 2000)
+    played.playback.follow([1, 2])
+    played.playback.follow([2])
+    newest = played.newest
+    wait_until(lambda: played.newest > newest + 10)
+
+
+def test_a_page_that_opens_alone_or_at_the_end_sees_the_take_from_the_start(played: Played) -> None:
+    """A take that plays while nobody looks would be over, and costs as much as one that somebody sees."""
+    control = played.playback._player.control
+    played.drag_to(20.0)
+    wait_until(lambda: played.newest > 2000)
+    played.playback.follow([])
+    assert played.playback.is_paused
+    played.playback.follow([2])
+    wait_until(lambda: 0 <= played.newest < 2000)
+    assert not played.playback.is_paused
+    played.drag_to(29.8)
+    wait_until(lambda: control.is_at_end)
+    played.playback.follow([2])
+    assert control.is_at_end
+    played.playback.follow([2, 3])
+    wait_until(lambda: 0 <= played.newest < 2000)
 
 
 def test_a_pause_stands_still_and_shows_where_the_slider_goes(played: Played) -> None:

@@ -82,7 +82,7 @@ def test_the_view_of_a_page_is_fitted_once_and_when_it_wants(
             _wait_for_camera(page)
             [number] = server.get_clients()
             cameras = viewer.scene._cameras
-            assert number in cameras._pages
+            wait_until(lambda: number in cameras._pages)
             cameras.fit_again(server.get_clients()[number])  # as its button does
             wait_until(lambda: number in cameras._pages)
 
