@@ -125,6 +125,27 @@ class Picture:
         """Wait until markers have these labels, and no others, at these positions in mm."""
         self.wait_for(_HAS_LABELS, labels)
 
+    def wait_for_labels_drawn_at(self, node: str, position: Position, count: int) -> None:
+        """Wait until so many labels are drawn, each at another place within 0.4 m of a position in mm."""
+        code = """([node, positions, count]) => {
+            const {scene, nodeRefFromName} = window.__viserMutable, places = new Set();
+            let data;
+            scene.traverse(({material}) => { data ??= material?.uniforms?.uLabelData?.value.image.data; });
+            const object = nodeRefFromName[node];
+            if (!data || !object) return false;
+            const place = object.position.clone().fromArray(positions[0].map(value => value / 1000));
+            place.applyMatrix4(object.matrixWorld);
+            let number = 0;
+            for (let i = 0; i < data.length; i += 4) {
+                const distances = [0, 1, 2].map(axis => data[i + axis] - place.getComponent(axis));
+                if (!data[i + 3] || Math.hypot(...distances) > 0.4) continue;
+                number++;
+                places.add([0, 1, 2].map(axis => data[i + axis].toFixed(4)).join());
+            }
+            return number === count && places.size === count;
+        }"""
+        self.page.wait_for_function(code, arg=[node, [position], count])
+
     def wait_for_text(self, pattern: str) -> None:
         """Wait until a label in the picture says this."""
         self.wait_for(_HAS_TEXT, pattern)

@@ -146,6 +146,19 @@ def test_labels_follow_the_parameters(scene: PublishedScene, picture: Picture) -
     picture.wait_for_labels({})
 
 
+def test_labels_at_the_same_place_are_beside_each_other_or_left_out(
+    scene: PublishedScene, picture: Picture
+) -> None:
+    """There are four sides of a place, so two of six labels are left out."""
+    picture.page.get_by_role("tab", name="Scene").click()
+    picture.page.get_by_label("Marker labels").check()
+    scene.markers = [TOP] * 6
+    picture.wait_for_labels_drawn_at(MARKERS, TOP, 4)
+    scene.markers = [LEFT, RIGHT, TOP]
+    picture.page.get_by_label("Marker labels").uncheck()
+    picture.wait_for_labels({})
+
+
 def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene, picture: Picture) -> None:
     picture.wait_for_drawn(MARKERS, LEFT, is_blue)
     scene.is_sending = False

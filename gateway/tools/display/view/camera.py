@@ -202,6 +202,8 @@ class Cameras:
 
     def __init__(self) -> None:
         self._pages: dict[int, _Page] = {}
+        self.distance_m = 5.0
+        """How far the camera that was fitted last is from what it turns around."""
         self._subject: Subject | None = None
         self._changed_s = 0.0
         self._check_s = 0.0
@@ -240,7 +242,8 @@ class Cameras:
                 seen = without_outliers(np.concatenate([_NO_POINTS, *points()]))
             if not len(seen):
                 return
-            self._pages[number] = _fitted_page(client, page, subject, seen, now_s)
+            self._pages[number] = fitted = _fitted_page(client, page, subject, seen, now_s)
+            self.distance_m = float(np.linalg.norm(fitted.pose.position - fitted.pose.look_at))
 
 
 def _fitted_page(

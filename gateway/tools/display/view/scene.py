@@ -21,16 +21,16 @@ from gateway.tools.display.view.camera import (
 )
 from gateway.tools.display.view.links import Links
 from gateway.tools.display.view.panel import Switches
+from gateway.tools.display.view.plates import Plates
 from gateway.tools.display.view.scene_items import (
     GREY,
     PLANES,
     UP_AXES,
     Markers,
-    Plates,
-    Tools,
     color_of,
     on_floor,
 )
+from gateway.tools.display.view.tools import Tools
 
 
 class Sphere(NamedTuple):
@@ -83,7 +83,9 @@ class World:
         }
         server.scene.add_frame("/world/axes", axes_length=_AXIS_M, axes_radius=0.006, origin_radius=0.012)
         for name, position in zip("xyz", _AXIS_M * np.eye(3), strict=True):
-            server.scene.add_label(f"/world/{name}", name, position=position, anchor="bottom-center")
+            server.scene.add_label(
+                f"/world/{name}", name, position=position, anchor="bottom-center", font_screen_scale=0.8
+            )
         self._unit = server.scene.add_label(
             "/world/unit", "1 m", anchor="center-center", font_screen_scale=0.8
         )
@@ -104,6 +106,9 @@ class World:
         self._unit.text = f"1 m = {1 / METRES_PER_NEWTON:.0f} N" if forces else "1 m"
         self._grids[self.up].visible = floor
 
+
+AXES_SHARE: Final = 0.06
+"""The length of the axes of tools, relative to the distance of the camera: about 30 pixels."""
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
 
@@ -137,9 +142,19 @@ class SourceScene:
         )
 
     def update(
-        self, source: DisplayedSource, up: UpAxis, switches: Switches, now_s: float, *, is_alone: bool
+        self,
+        source: DisplayedSource,
+        up: UpAxis,
+        switches: Switches,
+        now_s: float,
+        *,
+        axes_m: float,
+        is_alone: bool,
     ) -> None:
-        """Show the newest data of the source. If it is not alone, its labels begin with its name."""
+        """Show the newest data of the source, and tools with axes of a length of ``axes_m``.
+
+        If it is not alone, its labels begin with its name.
+        """
         if source.name != self._name:  # on LCM, a status says the name
             self._name = source.name
             self._switch.label = source.name
@@ -157,7 +172,8 @@ class SourceScene:
             positions, links = self._markers.positions, switches.links.value
             self._links.update(components["3d"], positions, now_s, shown=links)
         if "6d" in components:
-            self._tools.update(components["6d"], now_s, prefix, labels=switches.tool_labels.value)
+            tool_labels = switches.tool_labels.value
+            self._tools.update(components["6d"], prefix, labels=tool_labels, length_m=axes_m)
         self._plates.update(components.get("force"), source.newest_parameters, up, now_s, prefix)
         self._say_stopped(source.name, components, up)
 
@@ -235,7 +251,12 @@ class ViewScene:
             self._world.set_up(self._switches.up)
         for source in sources:
             self._sources[source.channels].update(
-                source, self._world.up, self._switches, now_s, is_alone=len(sources) == 1
+                source,
+                self._world.up,
+                self._switches,
+                now_s,
+                axes_m=AXES_SHARE * self._cameras.distance_m,
+                is_alone=len(sources) == 1,
             )
         has_plates = any(scene.has_plates for scene in self._sources.values())
         self._world.update(forces=has_plates, floor=self._switches.floor.value)

@@ -1,4 +1,4 @@
-"""What stands in the picture of a source: markers with trails, tools, force plates, and their labels."""
+"""What stands in the picture of a source: markers with trails, labels, colours and axes."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -7,16 +7,8 @@ from typing import Any, Final, Literal
 import numpy as np
 import viser
 
-from gateway.messages.descriptions.force_plates import (
-    METRES_PER_NEWTON,
-    PlacedPlate,
-    UpAxis,
-    force_on,
-    placed_plates,
-    units_of,
-)
+from gateway.messages.descriptions.force_plates import UpAxis
 from gateway.messages.encode import metres_per_unit
-from gateway.rtc3d.parameters import Parameters
 from gateway.runtime.safe_text import safe_text
 from gateway.takes.files.component_rows import Array
 from gateway.tools.display.live import LiveComponent
@@ -61,7 +53,7 @@ def color_of(number: int) -> Rgb:
 MAX_LABELS: Final = 300
 """How many items of one kind have labels."""
 
-_MAX_CHARACTERS: Final = 100
+MAX_CHARACTERS: Final = 100
 """How much of a label is drawn. Labels come from the network."""
 
 _PERIOD_S: Final = 1 / 15
@@ -128,12 +120,12 @@ class Labels:
             self._next = index + 1
 
     def _text(self, index: int) -> str:
-        return safe_text(self._prefix + self._texts[index], _MAX_CHARACTERS)
+        return safe_text(self._prefix + self._texts[index], MAX_CHARACTERS)
 
 
-_NO_LINES: Final = np.empty((0, 2, 3), np.float32)
+NO_LINES: Final = np.empty((0, 2, 3), np.float32)
 
-LENGTH_S: Final = 1.0
+LENGTH_S: Final = 0.5
 MAX_SEGMENTS: Final = 5000
 """How many segments all trails of a source have together; with many markers, trails are shorter."""
 
@@ -142,7 +134,7 @@ class Trails:
     """The trails of the markers of a source, drawn 15 times a second."""
 
     def __init__(self, scene: viser.SceneApi, name: str, color: Rgb) -> None:
-        self._node = scene.add_line_segments(name, _NO_LINES, color, thickness=1.5, thickness_units="screen")
+        self._node = scene.add_line_segments(name, NO_LINES, color, thickness=1.5, thickness_units="screen")
         self._history: deque[tuple[float, Array]] = deque()
 
     def update(self, positions: Array, now_s: float) -> None:
@@ -163,7 +155,7 @@ class Trails:
         """Remove the trails."""
         if self._history:
             self._history.clear()
-            self._node.points = _NO_LINES
+            self._node.points = NO_LINES
 
 
 GHOST_S: Final = 1.0
@@ -239,68 +231,6 @@ class Markers:
         self._points.points = self.positions[visible]
 
 
-_AXES_M: Final = 0.15
-_RADIUS_M: Final = 0.005
-_STOPPED_SIZE: Final = 0.3
-_MIN_NORM: Final = 1e-3
-"""A quaternion that is shorter says nothing about the orientation."""
-
-
-class Tools:
-    """The visible tools as axes with labels. ``path`` is the node above them."""
-
-    def __init__(self, scene: viser.SceneApi, path: str) -> None:
-        self._scene = scene
-        self._name = f"{path}/tools"
-        self._axes: viser.BatchedAxesHandle | None = None
-        self._labels = Labels(scene, f"{path}/tool labels")
-        self._head: Any = None
-        self._names: tuple[str, ...] = ()
-        self._sizes = np.empty(0, np.float32)
-        self.positions: Array = _NOTHING
-        """The positions in the newest frame, shape (tools, 3), in metres; NaN is missing."""
-
-    def update(self, component: LiveComponent, now_s: float, prefix: str, *, labels: bool) -> None:
-        """Show the newest frame. ``prefix`` precedes each label."""
-        if component.newest_head is not self._head:
-            self._head = component.newest_head
-            self._take(component)
-        size = _STOPPED_SIZE if component.is_stopped else 1.0
-        sizes = is_shown(self.positions) * np.float32(size)  # that of missing tools is 0
-        if self._axes is not None and not np.array_equal(sizes, self._sizes):
-            self._axes.batched_scales = self._sizes = sizes
-        self._labels.update(self.positions, self._names, now_s, prefix, shown=labels)
-
-    def _take(self, component: LiveComponent) -> None:
-        items = component.newest_items
-        self._names = component.description.labels
-        positions = positions_in_metres(items, component.description.unit)
-        quaternions = np.stack([items[name] for name in ("q0", "qx", "qy", "qz")], axis=-1)
-        norms = np.linalg.norm(quaternions.astype(np.float64), axis=1)
-        is_valid = np.isfinite(norms) & (norms > _MIN_NORM)
-        positions[~is_valid] = np.nan
-        self.positions = positions
-        visible = is_shown(positions)
-        turned = np.zeros((len(items), 4), np.float32)
-        turned[:, 0] = 1.0
-        turned[visible] = quaternions[visible] / norms[visible, None]
-        places = np.nan_to_num(positions)
-        if self._axes is not None and len(self._axes.batched_positions) == len(items):
-            self._axes.batched_wxyzs = turned
-            self._axes.batched_positions = places
-            return
-        self._sizes = np.zeros(len(items), np.float32)
-        self._axes = self._scene.add_batched_axes(
-            self._name,
-            turned,
-            places,
-            self._sizes,
-            axes_length=_AXES_M,
-            axes_radius=_RADIUS_M,
-            visible=len(items) > 0,
-        )
-
-
 UP_AXES: Final[tuple[UpAxis, ...]] = ("z", "y", "x")
 PLANES: Final[dict[UpAxis, Literal["xy", "zx", "yz"]]] = {"z": "xy", "y": "zx", "x": "yz"}
 """The floor for each axis that points up; seen from above, the second axis is left of the first one."""
@@ -310,115 +240,3 @@ def on_floor(up: UpAxis, first: float, second: float, height: float = 0.0) -> tu
     """Return a position by its coordinates on the two axes of the floor and above it."""
     by_axis = dict(zip((*PLANES[up], up), (first, second, height), strict=True))
     return by_axis["x"], by_axis["y"], by_axis["z"]
-
-
-MAX_PLATES: Final = 100
-MAX_ARROW_M: Final = 5.0
-
-_OUTLINE_COLOR: Final = (140, 145, 155)
-_ARROW_COLOR: Final = (235, 165, 20)
-_WIDTH_M: Final = 0.6
-_DEPTH_M: Final = 0.4
-_GAP_M: Final = 0.1
-_HEAD_M: Final = 0.06
-_MIN_ARROW_M: Final = 2 * _HEAD_M
-
-
-class Plates:
-    """The outlines and names of plates, and arrows of the forces on them. ``path`` is the node above them.
-
-    When data stop, the last arrows remain, in grey. Plates whose place is not known stand side by side at the
-    origin. Several sources may have the same
-    plates, so the labels of the first source, ``number`` 0, are at the centres, others towards corners.
-    """
-
-    def __init__(self, scene: viser.SceneApi, path: str, number: int) -> None:
-        self._number = number
-        self._outlines = scene.add_line_segments(
-            f"{path}/plates", _NO_LINES, _OUTLINE_COLOR, thickness=2.5, thickness_units="screen"
-        )
-        self._arrows = scene.add_arrows(
-            f"{path}/forces",
-            _NO_LINES,
-            _ARROW_COLOR,
-            shaft_radius=0.012,
-            head_radius=0.03,
-            head_length=_HEAD_M,
-        )
-        self._labels = Labels(scene, f"{path}/plate labels")
-        self._known: tuple[Parameters | None, int, UpAxis] = (None, 0, "z")
-        self._plates: list[PlacedPlate] = []
-        self._names: tuple[str, ...] = ()
-        self._label_places: Array = np.empty((0, 3), np.float32)
-        self._head: Any = None
-        self._is_stopped = False
-        self.corners: Array = np.empty((0, 3), np.float32)
-        """The corners of all plates, shape (corners, 3), in metres."""
-
-    def update(
-        self, component: LiveComponent | None, parameters: Parameters, up: UpAxis, now_s: float, prefix: str
-    ) -> None:
-        """Show the plates, and the forces of the newest frame. ``prefix`` precedes each label."""
-        num_items = 0 if component is None else len(component.newest_items)
-        if self._known[0] is not parameters or self._known[1:] != (num_items, up):
-            self._known = (parameters, num_items, up)
-            self._place(parameters, component, up)
-        self._labels.update(self._label_places, self._names, now_s, prefix)
-        is_stopped = component is not None and component.is_stopped
-        if is_stopped != self._is_stopped:
-            self._is_stopped = is_stopped
-            self._arrows.colors = np.array(GREY if is_stopped else _ARROW_COLOR, np.uint8)
-            self._outlines.colors = np.array(GREY if is_stopped else _OUTLINE_COLOR, np.uint8)
-        if component is not None and component.newest_head is not self._head:
-            self._head = component.newest_head
-            arrows = []
-            for plate, load in zip(self._plates, component.newest_items[:MAX_PLATES].tolist(), strict=False):
-                found = force_on(plate, load)
-                if found is None:
-                    continue
-                start = np.array(found.position)
-                arrow = np.array(found.force) * METRES_PER_NEWTON
-                length = float(np.linalg.norm(arrow))
-                if np.all(abs(start) <= MAX_M) and length > _MIN_ARROW_M:
-                    arrows.append((start, start + arrow * min(1.0, MAX_ARROW_M / length)))
-            self._arrows.points = np.array(arrows, np.float32).reshape(-1, 2, 3)
-
-    def _place(self, parameters: Parameters, component: LiveComponent | None, up: UpAxis) -> None:
-        found = placed_plates(parameters)
-        names = () if component is None else component.description.labels
-        count = min(MAX_PLATES, max(len(found), len(names)))
-        found = [*found, *[None] * (count - len(found))][:count]
-        num_unknown = 0
-        self._plates = []
-        for number, plate in enumerate(found):
-            if plate is None or not np.all(abs(np.array(plate.corners)) <= MAX_M):
-                label = names[number] if number < len(names) else f"plate {number + 1}"
-                self._plates.append(_nominal_plate(label, num_unknown, parameters, number, up))
-                num_unknown += 1
-            else:
-                self._plates.append(plate)
-        self._names = tuple(plate.label for plate in self._plates)
-        centres = np.array([plate.centre for plate in self._plates], np.float32).reshape(-1, 3)
-        corners = np.array([plate.corners for plate in self._plates], np.float32).reshape(-1, 4, 3)
-        towards = corners[:, self._number % 4] if self._number else centres
-        self._label_places = (centres + towards) / 2
-        self.corners = corners.reshape(-1, 3)
-        self._outlines.points = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3)
-
-
-def _nominal_plate(label: str, place: int, parameters: Parameters, number: int, up: UpAxis) -> PlacedPlate:
-    """Return a plate whose place is not known, at a place of its own on the floor."""
-    plates = parameters.force.plates if parameters.force else ()
-    units = units_of(plates[number]) if number < len(plates) else (1.0, 1.0)
-    x = place * (_WIDTH_M + _GAP_M)
-    corners = [
-        on_floor(up, x + sx * _WIDTH_M / 2, sy * _DEPTH_M / 2)
-        for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))
-    ]
-    return PlacedPlate(
-        f"{label} (place unknown)",
-        [list(corner) for corner in corners],
-        on_floor(up, x, 0.0),
-        on_floor(up, 0.0, 0.0, 1.0),
-        *units,
-    )

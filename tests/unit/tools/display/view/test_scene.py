@@ -12,9 +12,10 @@ from gateway.rtc3d.parameters import ForceChannel, Parameters, ParametersForce, 
 from gateway.tools.display.live import LiveComponent
 from gateway.tools.display.view.camera import Subject
 from gateway.tools.display.view.links import FIND_S, SAMPLE_US
-from gateway.tools.display.view.scene import ViewScene
-from gateway.tools.display.view.scene_items import GHOST_S, MAX_LABELS, MAX_SEGMENTS
+from gateway.tools.display.view.scene import AXES_SHARE, ViewScene
+from gateway.tools.display.view.scene_items import GHOST_S, LENGTH_S, MAX_LABELS, MAX_SEGMENTS
 from gateway.tools.display.view.segments import MIN_FRAMES
+from gateway.tools.display.view.tools import MAX_MOVED, MAX_TOOLS
 from gateway.tools.display.view.viewer import ViewServer
 from tests.support.errors import names
 from tests.support.takes import START_UTIME, parameters
@@ -69,6 +70,17 @@ class Picture:
     def switch(self, name: str, value: object) -> None:
         switch = getattr(self.scene._switches, "_up" if name == "up" else name)
         switch.value = value
+
+    def tools(self, source: str = "MOCAP_LAB") -> dict[str, list[float]]:
+        """Return where the visible tools are, by their labels."""
+        nodes = {index: self.node(f"tools/{index}", source) for index in range(MAX_TOOLS)}
+        return {
+            self.node(f"tools labels/{index}", source).text: [
+                round(float(value), 4) for value in node.position
+            ]
+            for index, node in nodes.items()
+            if node is not None and node.visible
+        }
 
     def switch_source(self, value: bool, source: str = "MOCAP_LAB") -> None:
         switch: Any = self.scene._sources[source]._switch
@@ -147,7 +159,7 @@ def test_data_that_stop_are_grey_and_the_picture_says_so(picture: Picture) -> No
     assert picture.node("markers").colors.tolist() == [128, 128, 128]
     assert picture.node("stopped").text == "lab: no data for 3 s"
     assert picture.node("stopped").visible
-    assert picture.node("tools").batched_scales.tolist() < [1.0]
+    assert np.unique(picture.node("tools/0/axes").colors).tolist() == [128]
     lab.send(TOOLS, [(1, 0, 0, 0, 0, 0, 500, 0)])
     picture.show()
     assert names(picture.node("stopped").text, "lab", "markers", "3 s")
@@ -207,7 +219,7 @@ def test_trails_follow_markers_and_are_interrupted_where_one_was_missing(picture
         picture.show(0.1)
     assert picture.points("trails") == [[0, 0, 0], [0.1, 0, 0], [0.3, 0, 0], [0.4, 0, 0]]
     lab.send(MARKERS, [(400, 0, 0, 0)])
-    picture.show(0.91)
+    picture.show(LENGTH_S)
     assert picture.points("trails") == [[0.4, 0, 0], [0.4, 0, 0]]
     picture.switch("trails", False)
     picture.show(0.1)
@@ -235,21 +247,42 @@ def test_tools_are_axes_with_labels_and_missing_ones_are_hidden(picture: Picture
     lab.send(TOOLS, [turned, (NAN,) * 8, (0, 0, 0, 0, 1, 1, 1, 0), (2, 0, 0, 0, 0, 0, 0, 0)])
     picture.show()
     picture.show(0.1)
-    tools = picture.node("tools")
-    assert tools.batched_scales.tolist() == [1, 0, 0, 1]
-    assert tools.batched_positions[0] == pytest.approx([0.1, 0.2, 0.3])
-    assert tools.batched_wxyzs[0] == pytest.approx([0.5] * 4)
-    assert tools.batched_wxyzs[3].tolist() == [1, 0, 0, 0]
-    assert np.isfinite(tools.batched_wxyzs).all()
-    assert np.isfinite(tools.batched_positions).all()
-    assert picture.shown_labels("tool labels").keys() == {"tool 1", "tool 4"}
+    assert picture.tools() == {"tool 1": [0.1, 0.2, 0.3], "tool 4": [0, 0, 0]}
+    assert picture.shown_labels("tools labels") == picture.tools()
+    assert picture.node("tools/0").wxyz == pytest.approx([0.5] * 4)
+    assert picture.node("tools/3").wxyz.tolist() == [1, 0, 0, 0]
     lab.send(TOOLS, [turned] * 2)
     picture.show(0.1)
-    assert picture.node("tools").batched_scales.tolist() == [1, 1]
-    assert len(picture.shown_labels("tool labels")) == 2
+    assert picture.tools().keys() == {"tool 1", "tool 2"}
     lab.send(TOOLS, [])
     picture.show(0.1)
-    assert not picture.node("tools").visible
+    assert picture.tools() == {}
+
+
+def test_more_tools_than_are_moved_at_a_time_are_moved_in_turns(picture: Picture, server: ViewServer) -> None:
+    lab = picture.lab()
+    for number in range(9):
+        lab.send(TOOLS, [(1, 0, 0, 0, 1000 + number, 0, 0, 0)] * (MAX_TOOLS + 10))
+        picture.show(0.1)
+    messages = server._connection.get_message_buffer()
+    lab.send(TOOLS, [(1, 0, 0, 0, 5000, 0, 0, 0)] * (MAX_TOOLS + 10))
+    before = messages.message_counter
+    for number in range(1, 4):
+        picture.show(0.1)
+        moved = sum(picture.node(f"tools/{index}").position[0] == 5 for index in range(MAX_TOOLS))
+        assert moved == number * MAX_MOVED
+    assert messages.message_counter - before < 3 * 3 * MAX_MOVED + 100
+    assert picture.node(f"tools/{MAX_TOOLS}") is None
+
+
+def test_the_axes_of_tools_grow_with_the_distance_of_the_camera(picture: Picture) -> None:
+    """At 5 m, axes of a fixed size were a few pixels long."""
+    lab = picture.lab()
+    lab.send(TOOLS, [(1, 0, 0, 0, 0, 0, 0, 0)])
+    for distance_m in (5.0, 20.0):
+        picture.scene._cameras.distance_m = distance_m
+        picture.show()
+        assert picture.node("tools/0/axes").points.max() == pytest.approx(AXES_SHARE * distance_m)
 
 
 def test_a_plate_is_where_the_parameters_say_and_its_arrow_at_the_centre_of_pressure(
@@ -264,6 +297,10 @@ def test_a_plate_is_where_the_parameters_say_and_its_arrow_at_the_centre_of_pres
     assert corners == {(0.4, 0.6, 0), (0, 0.6, 0), (0, 0, 0), (0.4, 0, 0)}
     assert picture.shown_labels("plate labels") == {"Left": [0.2, 0.3, 0]}
     assert picture.points("forces") == [[0.2, 0.35, 0], [0.2, 0.45, 0.5]]
+    assert picture.shown_labels("force values") == {"510 N": [0.2, 0.45, 0.5]}
+    lab.send(FORCE, [(0, 0, 5, 0, 0, 0)])  # it lifts off
+    picture.show(0.1)
+    assert picture.shown_labels("force values") == {}
 
 
 def test_the_mark_for_1_m_says_how_long_arrows_are_only_where_there_are_plates(picture: Picture) -> None:
@@ -356,9 +393,10 @@ def test_absurd_values_are_not_shown(picture: Picture, value: float) -> None:
         lab.send(FORCE, [(value,) * 6, (0, 0, value, 0, 0, 0), (0, 0, 1000, value, 0, 0)])
         picture.show(0.1)
     assert picture.points("markers") == []
-    tools, forces = picture.node("tools"), picture.node("forces").points
-    for shown in (tools.batched_positions, tools.batched_wxyzs, forces):
-        assert np.isfinite(shown).all()
+    forces = picture.node("forces").points
+    assert "tool 2" not in picture.tools()
+    assert np.isfinite(picture.node("tools/0").wxyz).all()
+    assert np.isfinite(forces).all()
     assert abs(forces).max(initial=0) < 10
 
 
