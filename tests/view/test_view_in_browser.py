@@ -103,9 +103,9 @@ def test_markers_are_drawn_where_they_are(scene: PublishedScene, picture: Pictur
 
 def test_the_key_f_fits_the_view_that_somebody_has_moved(scene: PublishedScene, picture: Picture) -> None:
     fitted = picture.camera_position
-    picture.page.mouse.move(60, 60)  # a notice covers the middle
+    picture.page.mouse.move(60, 280)  # a notice covers what is above
     picture.page.mouse.down()
-    picture.page.mouse.move(150, 60, steps=5)
+    picture.page.mouse.move(150, 280, steps=5)
     picture.page.mouse.up()
     picture.wait_until(lambda: picture.distance_to(fitted) > 0.5)
     picture.page.keyboard.press("f")
