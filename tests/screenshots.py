@@ -21,6 +21,9 @@ _TIMEOUT_MS: Final = 120_000
 _MOMENT: Final = (0.7, 0.95)
 """The places, in metres, between which the person stands on a plate and no label hides another one."""
 
+_ZOOM: Final = 4
+"""How many steps of the mouse wheel the camera comes nearer: the view fits the whole walk."""
+
 _NO_NOTICE: Final = ".mantine-Notifications-root { display: none }"
 """Software rendering is what this computer lacks, not what users see."""
 
@@ -56,10 +59,11 @@ def main() -> None:
         page = browser.new_page(viewport=_SIZE)
         page.set_default_timeout(_TIMEOUT_MS)
         page.goto(view.address)
-        page.get_by_role("tab", name="Scene").click()
-        page.get_by_label("Marker trails").check()
         page.wait_for_function(_ON_PLATES, arg=[*_MOMENT])
-        page.get_by_role("button", name="Fit view").click()
+        page.mouse.move(400, 400)
+        for _ in range(_ZOOM):
+            page.mouse.wheel(0, -100)
+            page.wait_for_timeout(300)
         for theme in ("light", "dark"):
             _picture(page, theme, ROOT / f"docs/view-{theme}.png")
         browser.close()

@@ -81,10 +81,13 @@ _FILLED: Final = 0.85
 """The share of the width or the height that the points fill; labels stand beside them."""
 
 _FROM: Final = (0.6, -1.0, 0.5)
-"""The direction to the camera: on the two axes of the floor, and up."""
+"""The usual direction to the camera: on the two axes of the floor, and up."""
 
 _NUM_DIRECTIONS: Final = 8
-"""From how many sides a picture in portrait format may be seen: from where it is largest."""
+"""From how many sides the points may be seen: from where they are largest, as a walk is from its side."""
+
+_MUCH_NEARER: Final = 1.1
+"""They are seen from the usual side unless the farthest is so many times nearer from another one."""
 
 
 def fitted_pose(points: Array, up: UpAxis, fov: float, aspect: float) -> Pose:
@@ -96,11 +99,17 @@ def fitted_pose(points: Array, up: UpAxis, fov: float, aspect: float) -> Pose:
     radius = MIN_RADIUS_M * np.eye(3)
     points = np.concatenate([points, middle + radius, middle - radius])
     first, second, height = _FROM
-    num_directions = 1 if aspect >= 1 else _NUM_DIRECTIONS
-    turns = np.exp(2j * np.pi * np.arange(num_directions) / num_directions) * complex(first, second)
+    turns = np.exp(2j * np.pi * np.arange(_NUM_DIRECTIONS) / _NUM_DIRECTIONS) * complex(first, second)
     directions = [on_floor(up, turn.real, turn.imag, height) for turn in turns]
     poses = [_pose_from(direction, points, up, fov, aspect) for direction in directions]
-    return min(poses, key=lambda pose: float(np.linalg.norm(pose.position - pose.look_at)))
+    farthest_m = [float(np.linalg.norm(points - pose.position, axis=1).max()) for pose in poses]
+    best = int(np.argmin(farthest_m))
+    return poses[best] if farthest_m[best] * _MUCH_NEARER < farthest_m[0] else poses[0]
+
+
+def _distance_m(pose: Pose) -> float:
+    """Return how far the camera is from what it turns around."""
+    return float(np.linalg.norm(pose.position - pose.look_at))
 
 
 def _pose_from(direction: tuple[float, ...], points: Array, up: UpAxis, fov: float, aspect: float) -> Pose:
@@ -180,8 +189,7 @@ class _Page:
 
     def note_place(self, position: Array, now_s: float) -> None:
         """Take note of where the browser says its camera is."""
-        distance = float(np.linalg.norm(self.pose.position - self.pose.look_at))
-        is_there = bool(np.linalg.norm(position - self.pose.position) <= _SAME * distance)
+        is_there = bool(np.linalg.norm(position - self.pose.position) <= _SAME * _distance_m(self.pose))
         self.is_moved |= not is_there and now_s - self.sent_s > _ARRIVE_S
 
     def must_fit(self, subject: Subject, now_s: float, *, is_check_due: bool) -> bool:
@@ -243,7 +251,7 @@ class Cameras:
             if not len(seen):
                 return
             self._pages[number] = fitted = _fitted_page(client, page, subject, seen, now_s)
-            self.distance_m = float(np.linalg.norm(fitted.pose.position - fitted.pose.look_at))
+            self.distance_m = _distance_m(fitted.pose)
 
 
 def _fitted_page(
