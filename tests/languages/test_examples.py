@@ -33,7 +33,10 @@ from tests.support.networks import free_port, open_zenoh
 pytestmark = pytest.mark.netns
 
 
-SCENE = SyntheticScene(markers=20, tools=0, analog=2, plates=0, rate_hz=200, analog_rate_hz=2000)
+RATE_HZ, ANALOG_RATE_HZ = 100, 1000
+SCENE = SyntheticScene(
+    markers=20, tools=0, analog=2, plates=0, rate_hz=RATE_HZ, analog_rate_hz=ANALOG_RATE_HZ
+)
 SUBSCRIBERS = [program for program in PROGRAMS if program.arguments is not None]
 
 
@@ -42,7 +45,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The Zenoh endpoint of a gateway that plays SCENE; like its simulator, it is a separate program."""
     folder = tmp_path_factory.mktemp("gateway")
     sizes = ("--markers", "20", "--tools", "0", "--analog", "2", "--plates", "0")
-    rates = ("--rate", "200", "--analog-rate", "2000")
+    rates = ("--rate", str(RATE_HZ), "--analog-rate", str(ANALOG_RATE_HZ))
     with run_gateway(folder, *sizes, *rates, ready="lab (analog): connected to") as endpoint:
         yield endpoint
 
@@ -65,7 +68,7 @@ def assert_lines_match_the_scene(text: str) -> None:
         step = int(line["sequence"]) - int(first["sequence"])
         number = int(line["number"])
         assert number == int(first["number"]) + step
-        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + step / 200, abs=2e-4)
+        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + step / RATE_HZ, abs=2e-4)
         assert line["version"] == "1"
         [items] = SCENE.items(ComponentType.MARKERS, np.array([number - 1]))
         visible = items[~np.isnan(items["x"])]
@@ -165,7 +168,7 @@ def test_each_frame_of_markers_is_printed_with_its_ten_analog_samples(
     complete = [line for line in lines if line and line["count"] == "10"]
     assert complete  # it may hear one component before the other, and lose messages on LCM
     for line in complete:
-        sample = round(float(line["time_s"]) * 2000)
+        sample = round(float(line["time_s"]) * ANALOG_RATE_HZ)
         [markers] = SCENE.items(ComponentType.MARKERS, np.array([sample // 10]))
         assert int(line["visible"]) == np.count_nonzero(~np.isnan(markers["x"]))
         assert int(line["frame"]) == sample // 10 + 1

@@ -25,20 +25,8 @@ ENDLESS = {
     "live_control.py": "Tool 1 at ",
     "live_two_sources.py": " mm apart, ",
 }
-SIMULATED = (
-    "--markers",
-    "3",
-    "--tools",
-    "1",
-    "--analog",
-    "2",
-    "--plates",
-    "1",
-    "--rate",
-    "100",
-    "--analog-rate",
-    "100",
-)
+_COUNTS = ("--markers", "3", "--tools", "1", "--analog", "2", "--plates", "1")
+SIMULATED = (*_COUNTS, "--rate", "100", "--analog-rate", "200")
 
 
 @pytest.fixture(scope="module")
