@@ -146,3 +146,29 @@ def test_replies_of_others_and_late_ones_about_takes_are_left_out(
         reply(1, "newest")
         wait_until(lambda: taken)
     assert taken == [b"newest"]
+
+
+def test_a_source_that_was_busy_has_not_answered(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is asked for its parameters again; otherwise, its recording would have none."""
+    queries = open_lcm(lcm_queries_url(lab.url))
+
+    def reply_to(_channel: str, data: bytes) -> None:
+        request, reply = rtc3d.parameters_request_t.decode(data), rtc3d.parameters_reply_t()
+        reply.request_id, reply.requester = request.request_id, request.requester
+        reply.error, reply.error_code = "later", "busy"
+        queries.publish("MOCAP_LAB_PARAMETERS_REPLY", reply.encode())
+        reply.error, reply.error_code, reply.xml = "", "", "<a/>"
+        queries.publish("MOCAP_LAB_PARAMETERS_REPLY", reply.encode())
+
+    answers: list[bool] = []
+    monkeypatch.setattr(
+        lab.recording, "answered", lambda _source, parameters: answers.append(parameters is not None)
+    )
+    with contextlib.closing(
+        LcmSubscriber(open_lcm(lcm_queries_url(lab.url)), "MOCAP_LAB_PARAMETERS_REQUEST", reply_to)
+    ):
+        lab.lcm.publish("MOCAP_LAB_3D", lab.markers(1))
+        wait_until(lambda: names(lab) == {"lab"})
+        lab.subscriber._query(lab.recording.sources_now[0])
+        wait_until(lambda: True in answers)
+    assert False not in answers
