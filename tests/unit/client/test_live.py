@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import time
 from collections.abc import Iterable, Iterator
 from typing import Any, Self
 
@@ -15,8 +16,9 @@ from gateway.client.client import GatewayAddress
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame, Sent
 from gateway.client.live_join import MAX_WAIT_S
-from gateway.client.live_stream import _MAX_WAIT_S, Live, live
+from gateway.client.live_stream import _MAX_WAIT_S, DESCRIBED_WITHIN_S, Live, live
 from gateway.errors import SelectionError
+from gateway.messages.history import sequence_of
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes.files.series import Series
 from gateway.takes.files.take import open_take
@@ -256,6 +258,41 @@ def test_a_frame_waits_for_its_parameters() -> None:
     data.feed([parameters(xml("head", "hand"))])
     [found] = data.frames(1)
     assert found.markers.labels == ("head", "hand")
+
+
+def test_parameters_that_never_come_are_awaited_once() -> None:
+    """Otherwise, the program would get the frames of each version two seconds late for ever."""
+    data = Fed()
+    data.feed([ones(MARKERS, 0, version=1)])
+    now_s = time.monotonic()
+    assert data._described(now_s) == ([], DESCRIBED_WITHIN_S)
+    now_s += DESCRIBED_WITHIN_S
+    for number in range(1, 4):
+        [given], _ = data._described(now_s)
+        assert sequence_of(given.message) == number - 1
+        data.feed([ones(MARKERS, number, version=1)])
+
+
+def test_what_is_collected_after_frames_that_waited_is_in_order() -> None:
+    """Frames that wait for their parameters came before those that came meanwhile."""
+    data = Fed()
+    data.feed([ones(MARKERS, 0, version=1)])
+    data._decode()
+    data.feed([ones(MARKERS, 1, version=1)])
+    assert data.collect().sources["lab"].series["3d"].sequence.tolist() == [0, 1]
+
+
+def test_what_comes_from_the_history_says_nothing_about_the_clock_of_the_gateway(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was sent long before it arrived; frames would seem to be seconds younger than they are."""
+    monkeypatch.setattr(live_frames, "now_steady_us", lambda: 0)
+    monkeypatch.setattr(live_frames, "now_utime", lambda: START_UTIME)
+    data = Fed()
+    data.feed([ones(MARKERS, 0, version=0, utime=START_UTIME - 10_000_000)])
+    [arrival] = data._reception.take_waiting()
+    [found] = live_frames.decode_frames([arrival._replace(is_past=True, steady_us=0)], START_UTIME)
+    assert found.age_s == pytest.approx(10.0, abs=0.1)
 
 
 def test_a_version_that_a_gateway_uses_again_means_the_parameters_of_its_time() -> None:

@@ -12,7 +12,7 @@ from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequ
 from gateway.client.recorder import FileWriter, RecordedSeries, RecordedSource, TakeRecording, Target
 from gateway.client.request_timing import GRACE_S
 from gateway.client.sources import FINGERPRINTS
-from gateway.errors import TakeError
+from gateway.errors import QueryError, TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES, PREFIX
 from gateway.messages.history import sequence_of
@@ -138,6 +138,48 @@ def test_series_are_refilled_side_by_side_so_that_the_file_follows_time(
         (number, f"MOCAP_LAB_{key}") for number in range(10) for key in ("3D", "EVENT")
     ]
     assert [number for number, _ in numbers] == sorted(number for number, _ in numbers)
+
+
+def test_what_waits_for_missing_messages_does_not_keep_these_from_being_requested(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each would wait for the other until the memory is full, and everything would be out of order."""
+    size = len(markers(0))
+    monkeypatch.setattr(recorder, "MAX_QUEUED_BYTES", 16 * 5 * size)
+    recorded.recording.complete(refuse, lambda *_: [], COMPLETE)
+    recorded.describe("lab")
+    wait_until(lambda: recorded.recording.queued_bytes == 0)
+    recorded.receive("lab", "3d", markers(0), markers(2))
+    recorded.receive("lab", "event", *map(events, range(10)))
+    wait_until(lambda: recorded.recording.has_room)
+    assert recorded.recording.queued_bytes >= 5 * size
+    recorded.events()
+
+
+def refuse(*_: object) -> HistoryAnswer:
+    raise QueryError("later", code="busy")
+
+
+def test_what_waits_for_missing_messages_keeps_its_order_if_the_clock_is_set_back(recorded: Recorded) -> None:
+    """Readers take a number that goes back for a restart of the gateway."""
+    recorded.recording.complete(refuse, lambda *_: [], COMPLETE)
+    recorded.describe("lab")
+    recorded.receive("lab", "3d", markers(0), markers(2))
+    set_back = [
+        FINGERPRINTS["event"] + PREFIX.pack(UTIME - n, UTIME - n, n, 1, 1) + bytes(16) for n in range(5)
+    ]
+    recorded.receive("lab", "event", *set_back)
+    assert [message for name, message in recorded.events() if name.endswith("EVENT")] == set_back
+
+
+def test_what_the_end_of_the_file_costs_is_counted_once(recorded: Recorded) -> None:
+    """The ends of the sources need room on a full disk, for which the newest message is removed."""
+    for name in ("lab", "hall"):
+        recorded.describe(name)
+    assert recorded.recording.file is not None
+    ends = [decode(message) for _, message in recorded.recording._ends(recorded.recording.file, 1)]
+    assert sorted(end.messages_lost for end in ends) == [0, 1]
+    recorded.events()
 
 
 @pytest.fixture
