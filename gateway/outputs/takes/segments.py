@@ -334,6 +334,7 @@ class RollingSegments(SourceWriter):
         if save.num_files >= _MAX_FILES:
             self._saves.remove(save)
             logger.warning("takes: %s ends, because it has %d files", save.folder, _MAX_FILES)
+            self._complete(save)
             return
         try:
             save.link(self._log.path)

@@ -268,10 +268,11 @@ def test_a_segment_that_cannot_be_linked_is_a_problem(
     assert numbers(save.folder) == [*range(30)]  # it was linked at its end
 
 
+@pytest.mark.parametrize("end", ["of the take", "of the gateway", "of the numbers for its files"])
 def test_a_saved_take_counts_what_could_not_be_linked(
-    rolling: Rolling, monkeypatch: pytest.MonkeyPatch
+    rolling: Rolling, monkeypatch: pytest.MonkeyPatch, end: str
 ) -> None:
-    """A take with a hole must not look whole."""
+    """A take with a hole must not look whole, however it ends."""
     rolling.write(10)
     save = rolling.save(60, goes_on=True)
     with monkeypatch.context() as patch:
@@ -279,7 +280,14 @@ def test_a_saved_take_counts_what_could_not_be_linked(
         rolling.write(20)
     rolling.write(10)
     assert numbers(save.folder) == [*range(10), *range(20, 40)]
-    rolling.segments.end_save(save)
+    match end:
+        case "of the take":
+            rolling.segments.end_save(save)
+        case "of the gateway":
+            rolling.segments.close()
+        case _:
+            monkeypatch.setattr(segments, "_MAX_FILES", 4)
+            rolling.write(20)
     assert TakesFolder(rolling.takes.parent).take_at(save.folder).num_lost == 10
 
 
@@ -382,6 +390,16 @@ def test_on_a_full_disk_the_oldest_segments_make_room_for_new_ones(
     assert kept == list(range(kept[0], 75))
     assert (rolling.segments.num_lost, rolling.disk.problem) == (0, "")
     assert 15 <= rolling.segments.kept_s() <= 35
+
+
+def test_room_is_made_by_what_has_expired_before_anything_else(rolling: Rolling) -> None:
+    """What has expired goes anyway; beyond it, each segment is a part of the promised last seconds."""
+    rolling.write(35)
+    rolling.clock.now_s += 36.0  # the first segment ended 61 s ago
+    left = []
+    while rolling.segments.delete_less_important():
+        left.append([numbers(path)[0] for path in rolling.files])
+    assert left == [[10, 20, 30], [20, 30], [30]]
 
 
 def test_without_any_segment_to_delete_new_messages_are_lost_at_once_and_counted(

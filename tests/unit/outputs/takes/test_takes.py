@@ -1,6 +1,7 @@
 """Takes that peers start, stop, save, list and read, without threads: the disk answers at once."""
 
 import asyncio
+import contextlib
 import math
 import socket
 from collections.abc import Callable, Collection, Coroutine
@@ -11,7 +12,7 @@ from typing import Any, NoReturn
 import lcm
 import pytest
 
-from gateway.errors import QueryError
+from gateway.errors import OutputError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
@@ -440,6 +441,20 @@ async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None
             pose.publish(bytes(16))
             pose.close()
     assert [event.channel for event in events(lab.path("walk.lcmlog"))[1:]] == ["MOCAP_LAB_6D_PROBE"] * 2
+
+
+async def test_the_list_counts_what_the_running_take_has_lost(tmp_path: Path) -> None:
+    """Who sees it at once can repeat the trial; the file says it only when it has ended."""
+    async with still_lab(tmp_path, max_queued_bytes=1000) as lab:
+        await lab.takes.start("walk")
+        for _ in range(20):
+            with contextlib.suppress(OutputError):
+                lab.publish()
+        num_lost = [take.num_lost for take in (await lab.takes.list()).takes]
+        running = (await lab.takes.list()).running
+    assert running is not None
+    assert num_lost == [running.num_lost]
+    assert running.num_lost > 0
 
 
 async def test_whoever_publishes_learns_when_messages_are_wanted(tmp_path: Path) -> None:
