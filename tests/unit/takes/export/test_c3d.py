@@ -350,6 +350,13 @@ def test_own_channels_are_used_if_they_give_the_recorded_loads(
     if plate_type == 4:
         assert np.allclose(found("FORCE_PLATFORM", "CAL_MATRIX")[..., 0], CALIBRATION)
     assert notes == []
+    # A frame that was lost says nothing about the others.
+    (tmp_path / "lost").mkdir()
+    messages = plate_messages(plate, channels, loads)
+    del messages[[channel for channel, _ in messages].index("MOCAP_LAB_FORCE") + 20]
+    found, _ = export_c3d(tmp_path / "lost", messages)
+    assert found("FORCE_PLATFORM", "TYPE").tolist() == [plate_type]
+    assert found.analog.shape == (num_channels, 40)
     # Loads that do not follow from the channels get channels of their own, which give them.
     found, _ = exported("other", 2 * loads)
     assert found("FORCE_PLATFORM", "TYPE").tolist() == [2]

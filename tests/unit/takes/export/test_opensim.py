@@ -355,6 +355,7 @@ AXES: list[tuple[Axis | None, Axis | None, str]] = [
     ("y", None, "x y z"),
     ("x", None, "z x y"),
     ("-z", None, "x -z y"),
+    ("-x", None, "z -x -y"),
     ("z", "y", "y z x"),
     ("z", "-x", "-x z y"),
     (None, "-y", "-y z -x"),
