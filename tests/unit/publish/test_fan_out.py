@@ -312,16 +312,19 @@ def test_every_output_shows_whether_frames_arrive_until_the_fan_out_is_closed() 
         assert (output.declared, output.announced, output.streaming) == ([], [], [True, False] * 2)
 
 
-def test_every_output_shows_once_whether_a_measurement_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("runs", [True, False])
+def test_every_output_shows_once_whether_a_measurement_runs(
+    monkeypatch: pytest.MonkeyPatch, *, runs: bool
+) -> None:
     shown: list[tuple[str, bool | None]] = []
     monkeypatch.setattr(ToyOutput, "show_measurement", lambda self, _, runs: shown.append((self.name, runs)))
     one, new = ToyOutput("one"), ToyOutput("new")
     fan_out = FanOut("lab", [one])
-    for is_running in (True, True):
+    for is_running in (runs, runs):
         fan_out.show_measurement(is_running)
     fan_out.set_outputs([one, new])
     fan_out.show_measurement(None)
-    assert shown == [("one", True), ("new", True), ("one", None), ("new", None)]
+    assert shown == [("one", runs), ("new", runs), ("one", None), ("new", None)]
 
 
 def test_tool_topics_stay_open_on_an_output_that_stays() -> None:

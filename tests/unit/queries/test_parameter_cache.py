@@ -211,6 +211,14 @@ async def test_another_frame_of_poses_is_another_version_of_the_parameters(sourc
     assert (await source.parameters()).version == 2
 
 
+async def test_no_section_goes_with_a_version_of_another_frame_of_poses(source: FakeSource) -> None:
+    """Who compares the version with that of frames would wait for parameters that never come."""
+    source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    assert (await source.parameters("6d")).version == 1
+    await source.queries.parameters.begin_version()
+    assert (await source.parameters("6d")).version == 2
+
+
 async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:
     source = FakeSource()
     await source.refresh()

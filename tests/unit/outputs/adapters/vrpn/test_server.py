@@ -218,6 +218,7 @@ async def test_slow_client_misses_its_own_poses_only(running: Running) -> None:
             return not server.send(encode_pose(1, 0, POSE))
 
         await wait_until_async(reads_again)
+        assert [client._timeout for client in server.clients] == [None]  # so it stays connected
 
 
 async def test_client_that_stops_reading_is_disconnected(
