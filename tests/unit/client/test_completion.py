@@ -335,6 +335,22 @@ def test_requests_without_a_connection_do_not_end_soon() -> None:
     assert network.numbers == [0]
 
 
+def test_a_restart_that_a_message_shows_holds_up_nothing_for_long_if_nobody_takes_requests() -> None:
+    """That message has shown a connection: the gateway may be one of an earlier version."""
+    network = Network()
+    network.arrives(3)
+    network.restart()
+    network.arrives(0)
+    start_s = network.now_s
+    while network.completion.due_s < math.inf:
+        network.now_s = network.completion.due_s
+        network.completion.fail(
+            *(network.completion.request(), "no-gateway", "", network.now_s), is_connected=False
+        )
+    assert network.handed_on == [(0, 3), (1, 0)]
+    assert network.now_s - start_s < 2 * NOBODY_S
+
+
 def test_patience_begins_again_after_a_time_without_connection() -> None:
     """While nothing arrives, no request can be answered: that says nothing about the history."""
     network = Network()
@@ -492,20 +508,20 @@ def test_what_came_before_the_first_message_is_unknown_if_nobody_says_it() -> No
     assert network.completion.unknown[Unknown.BEGINNING] == 1
 
 
-@pytest.mark.parametrize("has_restarted", [False, True])
+@pytest.mark.parametrize(("has_restarted", "num_published"), [(False, 3), (True, 3), (True, 4)])
 def test_the_last_messages_before_a_pause_are_requested_when_the_history_is_looked_up(
-    has_restarted: bool,
+    has_restarted: bool, num_published: int
 ) -> None:
     """Nothing later arrives that would show them: the end of a trial in an outage, or a whole second one."""
     network = Network()
     network.arrives(3)
     if has_restarted:
         network.restart()
-    newest = [network.publish() for _ in range(3)][-1]
+    newest = [network.publish() for _ in range(num_published)][-1]  # of four, the number that has arrived
     _, _, number, _, _ = PREFIX.unpack_from(newest, 8)
     network.completion.notice(number, network._utime, network.now_s)
     network.ask_all()
-    expected = [(1, number) for number in range(3)] if has_restarted else [(0, 4), (0, 5), (0, 6)]
+    expected = [(1, number) for number in range(num_published)] if has_restarted else [(0, 4), (0, 5), (0, 6)]
     assert network.handed_on == [(0, 3), *expected]
     assert network.completion.unknown[Unknown.RESTART] == has_restarted
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.client import live_frames, queued_reception
+from gateway.client import live_frames, live_join, queued_reception
 from gateway.client.client import GatewayAddress
 from gateway.client.history_requests import COMPLETE, HistoryAnswer, HistoryRequest
 from gateway.client.live_frames import ClockDifference, Frame, Sent
@@ -308,6 +308,25 @@ def test_parameters_that_come_later_with_a_version_known_by_then_count() -> None
     assert data.frames(1)[0].markers.labels == ("old",)
     data.feed([parameters(xml("new"), 1, utime=START_UTIME + 1_000_000), ones(MARKERS, 200, 1)])
     assert data.frames(1)[0].markers.labels == ("new",)
+
+
+def test_what_is_missing_in_any_of_the_joined_messages_is_the_gap() -> None:
+    """Who looks at the gap of a frame wants to know whether it has everything since the one before."""
+    messages = [ones(MARKERS, number, timestamp_us=number * 5000) for number in range(3)]
+    messages += [ones(ANALOG, number, timestamp_us=number * 1000) for number in (0, 1, 2, 4, 5, 6, 9, 10)]
+    data = Fed("lab", components=["3d", "analog"], join=True)
+    data.feed([parameters(xml()), *messages])
+    assert [each.gap for each in data.frames(3)] == [0, 1, 2]
+
+
+def test_what_a_join_leaves_out_is_counted_and_the_program_is_warned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As what a slow program loses: otherwise, the first component could be missing unsaid."""
+    monkeypatch.setattr(live_join, "MAX_FRAMES", 10)
+    data = Fed("lab", components=["3d", "analog"], join=True)
+    data.feed([parameters(xml()), *(ones(ANALOG, number) for number in range(30))])
+    with pytest.warns(RuntimeWarning, match="20 messages"):
+        data._decode()
+    assert data.num_dropped == 20
 
 
 @pytest.mark.parametrize("ahead", [MARKERS, ANALOG])

@@ -165,8 +165,10 @@ def test_what_waits_for_missing_messages_keeps_its_order_if_the_clock_is_set_bac
     recorded.recording.complete(refuse, lambda *_: [], COMPLETE)
     recorded.describe("lab")
     recorded.receive("lab", "3d", markers(0), markers(2))
+    times = [UTIME + 10_000_000 - number for number in range(5)]
     set_back = [
-        FINGERPRINTS["event"] + PREFIX.pack(UTIME - n, UTIME - n, n, 1, 1) + bytes(16) for n in range(5)
+        FINGERPRINTS["event"] + PREFIX.pack(utime, utime, n, 1, 1) + bytes(16)
+        for n, utime in enumerate(times)
     ]
     recorded.receive("lab", "event", *set_back)
     assert [message for name, message in recorded.events() if name.endswith("EVENT")] == set_back
