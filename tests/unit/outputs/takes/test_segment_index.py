@@ -155,6 +155,8 @@ async def test_numbers_that_begin_again_and_closed_topics_are_not_mixed(tmp_path
         other.publish(message(0, utime=1))
         again = await found_in(lab, "6d/left foot", 0)
         assert (again.messages, again.oldest, again.newest) == ([message(0, utime=1)], 0, 0)
+        other.publish(message(0, utime=2))  # of yet another run, which has reached the same number
+        assert (await found_in(lab, "6d/left foot", 0)).messages == [message(0, utime=2)]
 
 
 async def test_a_segment_that_somebody_removes_costs_only_its_messages(tmp_path: Path) -> None:

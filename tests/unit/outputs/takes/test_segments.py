@@ -356,6 +356,14 @@ def test_nothing_can_be_saved_before_the_first_message(rolling: Rolling) -> None
     assert rolling.segments.kept_s() == 3.0
 
 
+def test_a_disk_that_fails_ends_the_seconds_that_can_be_saved(rolling: Rolling) -> None:
+    """Who saves the last minute after an accident must not be promised what was never written."""
+    rolling.write(5)
+    rolling.disk.failed(rolling.path, OSError(errno.EIO, "Input/output error"))
+    rolling.clock.now_s += 100.0
+    assert rolling.segments.kept_s() == 4.0
+
+
 # A full disk ---------------------------------------------------------------------------------
 
 
