@@ -22,6 +22,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.runtime.failures import current_log_fields
 from gateway.runtime.workers import WorkerThread
 from gateway.session.c3d_files.spool import Spool
+from gateway.session.state import StreamState
 from tests.support.clocks import settle, until
 from tests.support.errors import names, raises
 from tests.support.servers import c3d_file, packet
@@ -144,6 +145,30 @@ async def test_the_status_describes_every_stream_and_output(new_lab: NewLab) -> 
     assert (status.source, status.server) == ("lab", f"{HOST}:3020")
     assert [stream.components for stream in status.streams] == ["3d", "analog"]
     assert [output.name for output in status.outputs] == ["toy"]
+
+
+@pytest.mark.parametrize(
+    ("states", "runs"),
+    [
+        ((StreamState.STREAMING, StreamState.NO_MEASUREMENT), True),
+        ((StreamState.NO_MEASUREMENT, StreamState.STREAMING), True),
+        ((StreamState.NO_MEASUREMENT, StreamState.WAITING), False),
+        ((StreamState.WAITING, StreamState.HANDSHAKING), None),
+    ],
+)
+async def test_a_measurement_runs_if_any_stream_has_frames(
+    new_lab: NewLab,
+    monkeypatch: pytest.MonkeyPatch,
+    states: tuple[StreamState, StreamState],
+    runs: bool | None,
+) -> None:
+    """Takes that follow it must not end while one of the streams still has its frames."""
+    lab, shown = new_lab(streams=TWO_STREAMS), [None]
+    monkeypatch.setattr(lab.output, "show_measurement", lambda _source, runs: shown.append(runs))
+    for status, state in zip(lab.source.statuses, states, strict=True):
+        former, status.state = status.state, state
+        status.on_state(former)
+    assert shown[-1] is runs
 
 
 @pytest.mark.parametrize("better", [0, 1])

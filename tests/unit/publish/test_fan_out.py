@@ -214,9 +214,9 @@ def test_numbers_of_items_are_compared_within_a_session() -> None:
     counts = ItemCounts("lab")
     updates: list[tuple[dict[ComponentType, int], int]] = [
         ({MARKERS: 2}, 1), ({MARKERS: 3}, 1), ({MARKERS: 4}, 2), ({TOOLS: 1}, 2), ({MARKERS: 4, TOOLS: 2}, 2),
-        ({MARKERS: 5, TOOLS: 2}, 2),
+        ({MARKERS: 5, TOOLS: 2}, 2), ({MARKERS: 5}, 3), ({MARKERS: 6, TOOLS: 3}, 3),
     ]  # fmt: skip
-    assert [counts.update(*each) for each in updates] == [False, True, False, False, True, True]
+    assert [counts.update(*each) for each in updates] == [False, True, False, False, True, True, False, True]
 
 
 def test_a_server_that_changes_its_number_all_the_time_does_not_fill_the_log(

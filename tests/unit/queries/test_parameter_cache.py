@@ -308,6 +308,19 @@ def labelled(labels: str) -> bytes:
     return in_root(f"<The_3D><Markers>{markers}</Markers></The_3D>")
 
 
+async def test_xml_that_could_not_be_read_is_not_returned_after_some_that_could() -> None:
+    """The stream that has sent both may end; another server's trouble of an hour ago helps nobody."""
+    source = FakeSource(two_streams=True)
+    await source.store_parameters(MM)
+    with pytest.raises(ReplyTimeoutError):
+        await source.connect_second(SILENCE)
+    await source.refresh(GARBAGE)
+    await source.refresh(MM)
+    source.disconnect()
+    source.server.replies["SendParameters"] = CM
+    assert (await source.parameters()).xml == CM
+
+
 # Peers ---------------------------------------------------------------------------------------
 
 

@@ -100,6 +100,16 @@ def test_frames_that_are_too_slow_are_reported_once(caplog: pytest.LogCaptureFix
     ]
 
 
+def test_other_components_on_an_open_connection_are_measured_anew() -> None:
+    """With streams: auto, they get another session; what was found about the former ones is void."""
+    lab = Lab()
+    assert lab.seconds([100] * 60) == [SLOW]
+    lab.status.session += 1
+    lab.second(100)
+    assert lab.status.limitations == []
+    assert lab.seconds([100] * 60) == [SLOW]
+
+
 def test_a_measurement_waits_for_enough_frames_of_the_followed_component() -> None:
     """Its time stamps are the measure: 20 of them are there after 20 s."""
     lab = Lab()

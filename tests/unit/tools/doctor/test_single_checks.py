@@ -202,6 +202,31 @@ def test_only_a_rate_of_the_slowest_component_is_explained_by_it(
     assert names(finding.remedy, "Move") is is_limited
 
 
+@pytest.mark.parametrize(
+    ("visible", "result"),
+    [
+        ({MARKERS: 0.5, TOOLS: 0.5}, Result.PASSING),
+        ({MARKERS: 1.0, TOOLS: 0.49}, Result.FAILING),
+        ({MARKERS: 0.49, TOOLS: 1.0}, Result.FAILING),
+        ({MARKERS: 0.0}, Result.FAILING),
+        ({TOOLS: 1.0}, Result.PASSING),
+        ({}, Result.NOT_TESTED),
+    ],
+)
+def test_half_of_the_markers_and_half_of_the_tools_must_be_in_view(
+    visible: dict[ComponentType, float], result: Result
+) -> None:
+    """Many markers that are seen do not make up for tools that nobody sees."""
+    observed = {
+        component: SimpleNamespace(visible_share=share, never_visible_indices=[0])
+        for component, share in visible.items()
+    }
+    stream = cast(ObservedStream, SimpleNamespace(observed=observed))
+    finding = frame_checks.check_visibility(Check("lab", "visibility"), stream, None)
+    assert finding.result is result
+    assert all(names(finding.found, component.item_noun) for component in visible)
+
+
 LINUX = "4096\t131072\t6291456\n"
 
 
