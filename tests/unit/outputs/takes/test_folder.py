@@ -49,6 +49,8 @@ def test_a_list_has_the_newest_take_first_with_its_time_and_length(takes: TakesF
     assert takes.take_at(lab / "fall").seconds == 20.000005
     stored(lab / "walk.lcmlog", log(1_000_000, 3_500_000, 4_000_000), 49)
     assert takes.take_at(lab / "walk").seconds == 3.0
+    stored(lab / "walk.lcmlog", log(2_000_000, 3_500_000, 4_000_000), 48)  # another one of the same size
+    assert takes.take_at(lab / "walk").seconds == 2.0
     stored(lab / "long.lcmlog", log(*range(0, 10**9, 10**6)))  # is measured by its end
     assert takes.take_at(lab / "long").seconds == 999.0
     with raises(QueryError, "removed"):

@@ -61,6 +61,25 @@ async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tm
     lab.output.close()
 
 
+async def test_a_take_that_ends_because_the_folder_is_full_leaves_the_segments(tmp_path: Path) -> None:
+    """Its end stops what has filled the folder; the last seconds are what is needed after such a surprise."""
+    clock = Clock()
+    async with still_lab(tmp_path, clock, keep_last_s=3600, max_bytes=MIB) as lab:
+        await lab.takes.start("walk")
+        for _ in range(4):
+            for _ in range(10):
+                lab.publish(size=1000)
+            await lab.output.storage.written()
+            clock.now_s += 10
+        before = sorted((tmp_path / ROLLING / "lab").iterdir())
+        lab.output.maintain()
+        assert lab.is_recording()
+        lab.output.maintain()
+        assert not lab.is_recording()
+        assert len(before) == 4
+        assert sorted((tmp_path / ROLLING / "lab").iterdir()) == before
+
+
 async def test_the_older_half_of_the_segments_makes_room_if_no_take_does(tmp_path: Path) -> None:
     """With long keep_last_s, the segments alone can be more than the limit."""
     clock = Clock()
