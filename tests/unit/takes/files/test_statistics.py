@@ -230,22 +230,22 @@ def steps_of(delays_us: list[int], per_window: int = 4) -> ClockSteps:
     ("delays_us", "expected"),
     [
         ([0] * 20, []),
-        ([0] * 5 + [2 * SECOND_US] * 6, [(7, 2 * SECOND_US)]),
+        ([0] * 5 + [2 * SECOND_US] * 6, [(7.0, 2 * SECOND_US)]),
         ([0] * 5 + [2 * SECOND_US] * 5, []),  # the last second may not be complete
         ([0] * 5 + [2 * SECOND_US] * 4 + [0] * 5, []),  # a stall
         ([0] * 5 + [499_999] * 10, []),  # like frames that arrive late
-        ([0] * 5 + [500_000] * 10, [(5, 500_000)]),
-        ([0] * 5 + [-3_600 * SECOND_US] * 6, [(-3_595, -3_600 * SECOND_US)]),
+        ([0] * 5 + [500_000] * 10, [(5.5, 500_000)]),
+        ([0] * 5 + [-3_600 * SECOND_US] * 6, [(-3_595.0, -3_600 * SECOND_US)]),
         ([0] * 5 + [number * SECOND_US for number in range(1, 12)] + [0] * 9, []),  # a network that clogs
-        ([0] * 5 + [2 * SECOND_US] * 6 + [0] * 6, [(7, 2 * SECOND_US), (11, -2 * SECOND_US)]),
+        ([0] * 5 + [2 * SECOND_US] * 6 + [0] * 6, [(7.0, 2 * SECOND_US), (11.0, -2 * SECOND_US)]),
     ],
 )
 def test_a_step_of_the_clock_is_told_from_a_stall(
-    delays_us: list[int], expected: list[tuple[int, int]]
+    delays_us: list[int], expected: list[tuple[float, int]]
 ) -> None:
     """A clock that was set bends every time in the take; a stall only looks like it."""
     steps = steps_of(delays_us).steps
-    assert [(step.utime // SECOND_US, step.step_us) for step in steps] == expected
+    assert [(step.utime / SECOND_US, step.step_us) for step in steps] == expected
 
 
 def test_after_a_long_pause_the_clock_is_compared_anew() -> None:

@@ -229,6 +229,24 @@ def test_what_comes_after_the_range_is_not_read(tmp_path: Path) -> None:
     assert open_take(path, from_s=29).num_damaged == 1
 
 
+def test_a_key_that_begins_after_the_range_does_not_end_the_reading_of_others(tmp_path: Path) -> None:
+    """A short take is read in one piece, in which everything that is wanted may come first."""
+    late = frame(ComponentType.ANALOG, [1.0], utime=START_UTIME + 30_000_000)
+    path = write_take(tmp_path / "a.lcmlog", [*(markers(1, number) for number in range(200)), late])
+    assert len(markers_in(open_take(path, to_s=1).sources["lab"])) == 100
+
+
+def test_takes_of_several_sources_in_one_file_are_told_apart(tmp_path: Path) -> None:
+    """As after ``cat a.lcmlog b.lcmlog``. Each has one description of each source."""
+    messages: list[Message] = []
+    for number in range(3):
+        messages += [description(source) for source in "abc"]
+        messages += [markers(1, number, source=source) for source in "abc"]
+    reader = TakeReader(write_take(tmp_path / "a.lcmlog", messages))
+    batches = [batch for found in reader.batches() for batch in found]
+    assert [batch.recording for batch in batches if batch.key == "3d"] == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+
+
 def test_one_message_with_damaged_numbers_does_not_end_a_run(tmp_path: Path) -> None:
     numbers = [markers(1, number) for number in range(3)]
     odd_time = markers(1, 3, timestamp_us=2**50, frame_number=-7)
