@@ -17,11 +17,15 @@ from gateway.daemon.source import Source, SourceHistory
 from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
+from gateway.queries.answers import ServerAnswer
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.runtime.failures import current_log_fields
 from gateway.runtime.workers import WorkerThread
 from gateway.session.c3d_files.spool import Spool
+from gateway.session.replies import UNANSWERED
 from gateway.session.state import StreamState
 from tests.support.clocks import settle, until
 from tests.support.errors import names, raises
@@ -169,6 +173,17 @@ async def test_a_measurement_runs_if_any_stream_has_frames(
         former, status.state = status.state, state
         status.on_state(former)
     assert shown[-1] is runs
+
+
+@pytest.mark.parametrize("gives", [True, False])
+async def test_only_parameters_show_that_a_silent_stream_is_answered(new_lab: NewLab, *, gives: bool) -> None:
+    """If the server stops giving any, the other stream does not get some by that."""
+    lab = new_lab(streams=TWO_STREAMS)
+    lab.source.statuses[1].add_limitation(UNANSWERED)
+    cache = lab.source.queries.parameters
+    answer = ServerAnswer((), b"<a/>", ParsedParameters(Parameters(), ()), 1, 1) if gives else None
+    await lab.source._announce_parameters(answer, cache.version + 1)
+    assert (UNANSWERED in lab.source.statuses[1].limitations) is not gives
 
 
 @pytest.mark.parametrize("better", [0, 1])

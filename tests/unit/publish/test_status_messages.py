@@ -189,3 +189,13 @@ async def test_frames_without_the_streams_components_are_a_problem_if_they_last(
     assert unusable_frames(status, 100.0) == ""
     status.components_received("")
     assert unusable_frames(status, 3.0) == ""
+
+
+async def test_rejected_frames_are_a_problem_as_long_as_no_others_come_and_they_still_do() -> None:
+    """A measurement that ended with a bad frame leaves nothing that anybody could repair."""
+    status = StreamStatus("3d")
+    status.frame_rejected("too short", 1)
+    assert names(unusable_frames(status, 100.0), "too short")
+    assert unusable_frames(status, 0.0) == ""
+    status.last_frame_s = running_clock().time()
+    assert unusable_frames(status, 100.0) == ""

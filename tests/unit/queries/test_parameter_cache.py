@@ -321,6 +321,16 @@ async def test_xml_that_could_not_be_read_is_not_returned_after_some_that_could(
     assert (await source.parameters()).xml == CM
 
 
+async def test_parameters_that_a_second_connection_shares_are_valid_as_long_as_that() -> None:
+    """The first one may reconnect while the server is busy; names and units must not be void meanwhile."""
+    source = FakeSource(two_streams=True, fresh_interval_s=3600.0)
+    await source.store_parameters(MM)
+    await source.connect_second(SILENCE)
+    await source.connect(SILENCE)
+    assert source.server.commands == []
+    assert {xml for xml, _ in source.announced} == {MM}
+
+
 # Peers ---------------------------------------------------------------------------------------
 
 

@@ -170,6 +170,21 @@ def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> 
     assert len(source.frames._join._samples) <= 2
 
 
+def test_a_component_that_moves_to_another_stream_does_not_change_the_rate_of_that() -> None:
+    """With streams: auto, the first stream takes over what a further one had, at its own rate."""
+    source, played = Source(), 20
+    for number in range(1, played + 1):
+        source.add(10_000 * number, markers(number, 10_000 * number))
+    for number in range(played, played + 10):
+        time_us = 10_000 * played + 1000 * number
+        both = number >= played + 5
+        source.add(
+            time_us, *([markers(number, time_us)] if both else []), analog(number, time_us), stream=FAST
+        )
+    assert source.arrivals.stream_of == {MARKERS: FAST, ANALOG: FAST}
+    assert source.arrivals.rates[FAST].period_us == 1000
+
+
 # Which frame is meant -----------------------------------------------------------------------
 
 
