@@ -43,7 +43,9 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "tools/display": ("unit/tools/display/test_* unit/tools/display/*/test_*",),
     "tools/cli": ("unit/tools/cli/test_*",),
     "config": ("unit/config/test_* property/*_config_*",),
+    "daemon": ("unit/daemon/test_*",),
     "daemon/monitoring": ("unit/daemon/monitoring/test_*",),
+    "takes/export": ("unit/takes/export/test_*",),
     "takes/files": ("unit/takes/files/test_* property/*takes* property/*_components_*",),
 } | {
     f"outputs/{path}": (
@@ -159,6 +161,8 @@ def load() -> list[Mutant]:
     entries = yaml.safe_load((ROOT / "tests/semantic_mutants.yaml").read_text(encoding="utf-8"))
     mutants = [Mutant(number, **entry) for number, entry in enumerate(entries, start=1)]
     for each in mutants:
+        if each.package not in TESTS:
+            raise ValueError(f"{each.file} has a mutant, and TESTS names no tests of {each.package}")
         compile(each.mutated((ROOT / each.file).read_text(encoding="utf-8")), str(each), "exec")
     return mutants
 

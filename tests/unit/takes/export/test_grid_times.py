@@ -176,19 +176,6 @@ def test_the_time_of_the_last_row_is_reported_if_the_announced_rate_is_a_little_
     assert names(note, word, "38.0 ms")
 
 
-def test_a_step_of_the_clock_soon_after_the_beginning_moves_no_row(tmp_path: Path) -> None:
-    """The clock of a gateway that has just been started is often set; the first frame says when it began."""
-    first_us = START_UTIME + 10_000
-    messages = [labelled("head"), *(
-        markers(1, number, utime=first_us + PERIOD_US * number + (3_600_000_000 if number >= 30 else 0))
-        for number in range(200)
-    )]  # fmt: skip
-    take = write_take(tmp_path / "take.lcmlog", messages)
-    export_take(ExportJob(take, tmp_path / "take.trc"))
-    times_s = trc_times(tmp_path / "take.trc")
-    assert abs(times_s - (8000 + PERIOD_US * np.arange(200)) / 1e6).max() < 0.001
-
-
 @pytest.mark.parametrize("form", [".c3d", ".trc", "bids"])
 def test_a_number_of_markers_that_varies_is_one_measurement(tmp_path: Path, form: str) -> None:
     """Servers send markers without a label, so each frame may have another number of them."""
