@@ -1,4 +1,4 @@
-"""Mutation tests: change what the code means in about 200 ways, and count what no test notices.
+"""Mutation tests: change what the code means in about 250 ways, and count what no test notices.
 
     .venv/bin/python -m tests.mutants
     .venv/bin/python -m tests.mutants stream outputs/zenoh --jobs 4

@@ -76,7 +76,7 @@ build/bin/actionlint:
 	@if command -v go >/dev/null; then GOBIN='$(CURDIR)/build/bin' go install $(ACTIONLINT); \
 	else echo 'The workflows are not checked: go is missing (Debian: golang-go)'; fi
 
-# Mutation tests: about 200 changes of meaning, each of which some test should notice. PACKAGES="session publish"
+# Mutation tests: about 250 changes of meaning, each of which some test should notice. PACKAGES="session publish"
 # selects packages. Not part of the check.
 PACKAGES ?=
 
