@@ -3,8 +3,8 @@
 Start with ``output``: one node, on the Zenoh router that ROS uses. It opens its session as the output
 ``zenoh`` does. One thread encodes messages and makes all calls that can wait for a router that does not read.
 
-- ``source``: one source. It takes frames in the event loop and hands those that somebody wants to the thread,
-  which knows the topics of the source, and which messages a frame becomes.
+- ``source``: one source. It takes frames in the event loop and hands those that somebody wants to the thread.
+- ``source_topics``: the topics of a source, and which messages a frame becomes.
 - ``topic``: a topic as rmw_zenoh has it: its key with the type's hash, its liveliness token, the attachment
   of each message with the publisher's id and number.
 - ``diagnostics``: the status of a source as ROS 2 shows it. The messages in CDR are in ``messages.ros2``.

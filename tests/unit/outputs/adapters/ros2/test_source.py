@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.outputs.adapters.ros2.source import MAX_PLATES, MAX_TOOLS
+from gateway.outputs.adapters.ros2.source_topics import MAX_PLATES, MAX_TOOLS
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate, Point
 from tests.support import ros_messages as ros
@@ -154,7 +154,7 @@ def test_a_subscriber_that_came_before_its_topic_is_noticed() -> None:
     source.publisher.check_subscribers()
     assert not source.publisher.wants(ALL)
     assert source.num_changes == 2
-    [topic] = source.publisher._by_component[MARKERS]
+    [topic] = source.publisher._topics.by_component[MARKERS]
     topic.wanted = True  # noted in another thread, which has not got further
     source.node.matching.add("/mocap/lab/markers")
     source.publisher.check_subscribers()
