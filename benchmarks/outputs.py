@@ -293,7 +293,7 @@ def main() -> None:
     tf = RosTopic("/tf", TF_MESSAGE, lambda: None)
     tf.declare(network)
     static = StaticTransforms(lambda: None)
-    source = RosSource("lab", "/mocap/lab", tf, static, network, network, SentMessages())
+    source = RosSource("lab", "/mocap/lab", tf, static, {}, network, network, SentMessages())
     tools = Parameters6D(tools=tuple(Tool(str(number), f"Tool {number}") for number in range(_TOOLS)))
     frame = CoordinateFrame("lab", 1e-3, (0.0, 0.0, 0.6, 0.8), (1.0, 2.0, 3.0))
     source.set_parameters(ServerParameters(b"", 1, 1, parsed=Parameters(tools=tools), frame=frame))

@@ -5,7 +5,7 @@ underscore at the beginning. (A part with a leading underscore is hidden from ``
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gateway.messages.topics import unique_name
@@ -27,6 +27,12 @@ ROS accepts topics of at most 247 characters.
 """
 
 
+NO_NAMES: Final[Mapping[str, str]] = {}
+
+PLATE_NAME: Final = re.compile(r"force_\d+")
+"""What ``plate_name`` returns; no tool may be called so."""
+
+
 def ros_name(text: str, noun: str) -> str:
     """Return ``text`` as a part of a topic; ``noun`` begins it if it has no letter at its beginning.
 
@@ -38,29 +44,33 @@ def ros_name(text: str, noun: str) -> str:
     return name or noun
 
 
-def unique_ros_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
-    """Return a different part of a topic for each of the labels.
+def unique_ros_names(
+    labels: Sequence[str], noun: str, chosen: Mapping[str, str] = NO_NAMES
+) -> tuple[str, ...]:
+    """Return a different part of a topic for each of the labels, which differ.
 
-    A name that an earlier label has gets _2, _3, …. A label without any usable character is called by its
-    position, such as tool_3.
+    ``chosen`` has the names of some labels. For others, a name that is chosen, or that an earlier label has,
+    gets _2, _3, …. A label without any usable character is called by its position, such as tool_3.
     """
-    names: dict[str, None] = {}
+    taken = set(chosen.values())
+    names = []
     for position, label in enumerate(labels, start=1):
-        name = ros_name(label, noun)
-        if name == noun:
-            name = f"{noun}_{position}"
-        elif _PLATE_NAME.fullmatch(name):
-            name = f"{noun}_{name}"  # on /tf, plates and tools are side by side
-        names[unique_name(name, names, MAX_PART_CHARS)] = None
+        name = chosen.get(label)
+        if name is None:
+            name = ros_name(label, noun)
+            if name == noun:
+                name = f"{noun}_{position}"
+            elif PLATE_NAME.fullmatch(name):
+                name = f"{noun}_{name}"  # on /tf, plates and tools are side by side
+            name = unique_name(name, taken, MAX_PART_CHARS)
+            taken.add(name)
+        names.append(name)
     return tuple(names)
 
 
 def pose_topic(tool: str) -> str:
     """Return the topic of a tool, below that of its source; ``tool`` is one of ``unique_ros_names``."""
     return f"{tool}/pose"
-
-
-_PLATE_NAME: Final = re.compile(r"force_\d+")
 
 
 def plate_name(number: int) -> str:

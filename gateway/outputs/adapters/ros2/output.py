@@ -122,8 +122,12 @@ class Ros2Output(FrameOutput):
             source.declare(node)
 
     def _declare_tf(self) -> None:
-        """Declare /tf if the streams of any source request tools, in the sending thread."""
-        if self._node is not None and any(source.has_tools for source in list(self._sources.values())):
+        """Declare /tf if the streams of any source request tools, in the sending thread.
+
+        If the settings switch it off, nobody can subscribe to it, so that nothing is encoded for it.
+        """
+        has_tools = any(source.has_tools for source in list(self._sources.values()))
+        if self._node is not None and self.settings.tf and has_tools:
             self._tf.declare(self._node)
         else:
             self._tf.undeclare()
@@ -161,8 +165,9 @@ class Ros2Output(FrameOutput):
             self._names[source] = name
         name = self._names[source]
         base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
+        tools = self.settings.tools.get(source, {})
         self._sources[source] = publisher = RosSource(
-            *(source, base, self._tf, self._static, self._router, self), self._confirmation.of(source)
+            *(source, base, self._tf, self._static, tools, self._router, self), self._confirmation.of(source)
         )
         self.submit(lambda: None if self._node is None else publisher.declare(self._node))
         return publisher

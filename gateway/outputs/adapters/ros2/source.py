@@ -12,6 +12,7 @@ import zenoh
 from gateway.errors import OutputError, raise_unless_defect
 from gateway.messages.encode import Stamp
 from gateway.messages.ros2.encode import ros_stamp
+from gateway.outputs.adapters.ros2.settings import Tool
 from gateway.outputs.adapters.ros2.source_topics import NO_PARAMETERS, Messages, SourceTopics
 from gateway.outputs.adapters.ros2.stamps import DistinctStamps
 from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
@@ -41,7 +42,8 @@ class Sender(Protocol):
 class RosSource:
     """A FramePublisher: the sending thread publishes each frame of which somebody receives something.
 
-    ``name``, ``base``, ``tf`` and ``static`` are as for SourceTopics. ``sent`` counts what Zenoh has taken.
+    ``name``, ``base``, ``tf``, ``static`` and ``tools`` are those of SourceTopics. ``sent`` counts what Zenoh
+    has taken.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class RosSource:
         base: str,
         tf: RosTopic,
         static: StaticTransforms,
+        tools: Mapping[str, Tool],
         router: SessionHolder,
         sender: Sender,
         sent: SentMessages,
@@ -59,7 +62,7 @@ class RosSource:
         """Called in any thread."""
         self.losses = Losses(logger, f"{name} to ros2")
         """Where to count what cannot be published."""
-        self._topics = SourceTopics(name, base, tf, static, self.update_wanted, lambda: self.losses)
+        self._topics = SourceTopics(name, base, tf, static, tools, self.update_wanted, lambda: self.losses)
         self._router = router
         self._sender = sender
         self._sent = sent

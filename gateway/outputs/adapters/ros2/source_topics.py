@@ -35,6 +35,7 @@ from gateway.messages.ros2.names import (
     wrench_topic,
 )
 from gateway.messages.ros2.plates import RosPlate, ros_plates, transforms_of
+from gateway.outputs.adapters.ros2.settings import Tool
 from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
@@ -85,6 +86,7 @@ class SourceTopics:
     ``name`` is the source's name in the configuration, ``base`` the beginning of its topics: /mocap/lab.
     ``tf`` is the topic /tf, which all sources share, and ``static`` has /tf_static. There, frames of tools
     and plates begin with the source's name, so that they differ even if sources have one frame: lab/wand.
+    ``tools`` has those, by label, that are called otherwise or are left out.
     ``on_wanted_changed`` is called in any thread when subscribers come or go, or topics. ``losses`` returns
     where to count what cannot be published.
     """
@@ -95,6 +97,7 @@ class SourceTopics:
         base: str,
         tf: RosTopic,
         static: StaticTransforms,
+        tools: Mapping[str, Tool],
         on_wanted_changed: Callable[[], None],
         losses: Callable[[], Losses],
     ) -> None:
@@ -109,6 +112,8 @@ class SourceTopics:
         self._base = base
         self._tf = tf
         self._static = static
+        self._settings = tools  # by label
+        self._chosen_names = {label: tool.name for label, tool in tools.items() if tool and tool.name}
         self._on_wanted_changed = on_wanted_changed
         self._losses = losses
         self._node: RosNode | None = None
@@ -164,7 +169,7 @@ class SourceTopics:
         self._channels = AnalogEncoder(())
         self._markers: RosTopic | None = None
         self._analog: RosTopic | None = None
-        self._tools: list[_Tool] = []
+        self._tools: list[_Tool | None] = []  # None is one that is left out
         self._plates: list[_Plate] = []
         self.names = {}
 
@@ -182,7 +187,7 @@ class SourceTopics:
             self._open_plates(num_plates)
         self.all = tuple(self._by_name.values())
         self.by_component = {
-            ComponentType.TOOLS: (self._tf, *(tool.topic for tool in self._tools)),
+            ComponentType.TOOLS: (self._tf, *(tool.topic for tool in self._tools if tool is not None)),
             ComponentType.FORCE: tuple(topic for plate in self._plates for topic in plate.topics),
             ComponentType.MARKERS: () if self._markers is None else (self._markers,),
             ComponentType.ANALOG: () if self._analog is None else (self._analog,),
@@ -191,12 +196,20 @@ class SourceTopics:
 
     def _open_tools(self, num_tools: int) -> None:
         labels = describe(ComponentType.TOOLS, self._described_by.parsed, num_tools).labels
-        names = unique_ros_names(labels, "tool")
-        for name in names[len(self._tools) :]:
-            topic = self._topic(pose_topic(name), POSE_STAMPED)
-            transform = TransformNames(self._frame.frame_id, f"{self._source}/{name}")
-            self._tools.append(_Tool(topic, transform))
-        self._show_names(ComponentType.TOOLS, labels, names)
+        names = unique_ros_names(labels, "tool", self._chosen_names)
+        named = [*zip(labels, names, strict=True)]
+        for label, name in named[len(self._tools) :]:
+            self._tools.append(None if self._is_left_out(label) else self._new_tool(label, name))
+        self._show_names(ComponentType.TOOLS, [each for each in named if not self._is_left_out(each[0])])
+
+    def _is_left_out(self, label: str) -> bool:
+        return self._settings.get(label) is False
+
+    def _new_tool(self, label: str, name: str) -> _Tool:
+        tool = self._settings.get(label)
+        child_frame = (tool and tool.child_frame) or f"{self._source}/{name}"
+        topic = self._topic(pose_topic(name), POSE_STAMPED)
+        return _Tool(topic, TransformNames(self._frame.frame_id, child_frame))
 
     def _open_plates(self, num_plates: int) -> None:
         parsed = self._described_by.parsed
@@ -207,10 +220,10 @@ class SourceTopics:
             pressure = None if plate.frame is None else self._topic(pressure_topic(name), POINT_STAMPED)
             self._plates.append(_Plate(plate, wrench, pressure))
         labels = describe(ComponentType.FORCE, parsed, num_plates).labels
-        self._show_names(ComponentType.FORCE, labels, names)
+        self._show_names(ComponentType.FORCE, [*zip(labels, names, strict=True)])
 
-    def _show_names(self, component: ComponentType, labels: Sequence[str], names: Sequence[str]) -> None:
-        changed = {label: name for label, name in zip(labels, names, strict=True) if name != label}
+    def _show_names(self, component: ComponentType, named: Sequence[tuple[str, str]]) -> None:
+        changed = {label: name for label, name in named if name != label}
         self.names = {**self.names, component.key: changed}
 
     def _topic(self, name: str, ros_type: RosType) -> RosTopic:
@@ -250,15 +263,16 @@ class SourceTopics:
 
     def _encode_tools(self, items: Items, stamp: bytes, encoded: Messages) -> None:
         is_tf_wanted = self._tf.wanted
-        if not (is_tf_wanted or any(tool.topic.wanted for tool in self._tools)):
+        if not (is_tf_wanted or any(tool.topic.wanted for tool in self._tools if tool)):
             return
         self._count_too_many("tools", len(items), MAX_TOOLS)
         head = self._stamped.head(stamp)
         transforms = []
         poses = self._frame.poses(items[: len(self._tools)])
-        for (topic, names), pose in zip(self._tools, poses, strict=False):  # a frame can have fewer tools
-            if pose is None:  # out of view
+        for tool, pose in zip(self._tools, poses, strict=False):  # a frame can have fewer tools
+            if pose is None or tool is None:  # out of view, or left out
                 continue
+            topic, names = tool
             content = pack_pose(*pose[:7])
             transforms.append((names, content))
             if topic.wanted:

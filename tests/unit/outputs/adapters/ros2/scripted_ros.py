@@ -10,6 +10,7 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.ros2.encode import TF_MESSAGE
+from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.adapters.ros2.source import RosSource
 from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosTopic
@@ -136,7 +137,14 @@ class Sender:
 class Source:
     """The source "lab", declared on a node. ``changes`` is what was wanted after each change."""
 
-    def __init__(self, given: ServerParameters | None = None, *, is_declared: bool = True) -> None:
+    def __init__(
+        self,
+        given: ServerParameters | None = None,
+        *,
+        is_declared: bool = True,
+        tools: Mapping[str, Any] | None = None,
+    ) -> None:
+        settings = Ros2Settings.model_validate({"tools": {"lab": tools or {}}})
         self.node, self.router, self.sender = Node(), Router(), Sender()
         self.tf = RosTopic("/tf", TF_MESSAGE, self._update_wanted)
         self.static = StaticTransforms(self._send_static)
@@ -144,7 +152,16 @@ class Source:
         router: Any = self.router
         sender: Any = self.sender
         self.publisher = RosSource(
-            *("lab", "/mocap/lab", self.tf, self.static, router, sender, self.messages_sent)
+            *(
+                "lab",
+                "/mocap/lab",
+                self.tf,
+                self.static,
+                settings.tools["lab"],
+                router,
+                sender,
+                self.messages_sent,
+            )
         )
         self.publisher.losses = Losses(logging.getLogger("tests"), "lab to ros2")
         self.num_changes = 0

@@ -88,6 +88,14 @@ def test_sources_whose_names_are_alike_in_ros_differ(monkeypatch: pytest.MonkeyP
     assert lab.output.topic_names("elsewhere") == {}
 
 
+def test_without_tf_only_the_topics_of_tools_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The settings of another source with the same labels are not those of this one."""
+    lab = Output(monkeypatch, tf=False, tools={"lab": {"wand": {"name": "hand"}}})
+    lab.source("lab", "wand")
+    lab.source("hall", "wand")
+    assert lab.node.open == {"/diagnostics", "/mocap/lab/hand/pose", "/mocap/hall/wand/pose"}
+
+
 def test_maintenance_finds_subscribers_that_were_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of every topic; while a check waits, no other one is queued, nor without a router."""
     lab = Output(monkeypatch)

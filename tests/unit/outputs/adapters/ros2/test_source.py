@@ -118,6 +118,31 @@ def test_names_that_differ_from_labels_are_shown() -> None:
     assert source.publisher.names == {"6d": {}}
 
 
+def test_tools_have_the_names_and_frames_of_the_settings_and_some_are_left_out() -> None:
+    """The items of a frame stay in their order, even those without topics."""
+    chosen = {
+        "wand": {"name": "hand", "child_frame": "hand_link"},
+        "cup": False,
+        "gone": {"name": "Left_Foot"},
+    }
+    source = Source(parameters(("cup", "wand", "Left Foot", "hand")), tools=chosen)
+    names = ("hand", "Left_Foot_2", "hand_2")
+    assert source.node.open == {"/tf", *(f"/mocap/lab/{name}/pose" for name in names)}
+    assert source.publisher.names == {"6d": {"wand": "hand", "Left Foot": "Left_Foot_2", "hand": "hand_2"}}
+    source.subscribe()
+    source.send(tools_frame((1, 0, 0), (2, 0, 0), None, (4, 0, 0), (5, 0, 0)))
+    moved = source.message("/tf", "tf2_msgs/msg/TFMessage").transforms
+    assert {each.child_frame_id: each.transform.translation.x for each in moved} == {
+        "hand_link": 0.002,
+        "lab/hand_2": 0.004,
+    }
+    pose = source.message("hand/pose", "geometry_msgs/msg/PoseStamped").pose
+    assert pose.position.x == 0.002
+    source.publisher.prepare(tools_frame(*[(0, 0, 0)] * 5).layout, ALL)
+    source.sender.run()
+    assert "/mocap/lab/tool_5/pose" in source.node.open
+
+
 # What is wanted -----------------------------------------------------------------------------
 
 

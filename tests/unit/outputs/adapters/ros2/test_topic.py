@@ -125,6 +125,7 @@ def test_names_are_different_and_unusable_labels_are_called_by_position() -> Non
         *("Tool_1", "Tool_1_2", "tool_3", "tool_4", "tool_3_2", "Tool_1_3"),
     )
     assert unique_ros_names(["Fuß", "Fuss", "Fu"], "tool") == ("Fuss", "Fuss_2", "Fu")
+    assert unique_ros_names(["a", "b"], "tool", {"b": "a", "c": "a_2"}) == ("a_3", "a")
     assert unique_ros_names(["x" * 100] * 256, "tool")[-1] == "x" * 48 + "_256"
 
 
