@@ -25,8 +25,8 @@ from benchmarks.workloads import DENSE, Paced, send
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import MESSAGE_TYPES, Stamp
 from gateway.messages.ros2.encode import TF_MESSAGE
+from gateway.outputs.adapters.ros2.latched import StaticTransforms
 from gateway.outputs.adapters.ros2.source import RosSource
-from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import Declared, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.registry import OUTPUTS

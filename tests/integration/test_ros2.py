@@ -33,6 +33,7 @@ TYPES: Final = {
     "/mocap/hall_2/force_1/wrench": "geometry_msgs/msg/WrenchStamped",
     "/mocap/hall_2/force_1/centre_of_pressure": "geometry_msgs/msg/PointStamped",
     "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/mocap/hall_2/labels": "diagnostic_msgs/msg/DiagnosticArray",
 }
 """A topic of each type."""
 
@@ -89,6 +90,9 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
     [plate] = messages["/tf_static"]["transforms"]
     assert (plate["header"]["frame_id"], plate["child_frame_id"]) == ("hall-2", "hall-2/force_1")
     assert messages["/mocap/hall_2/force_1/wrench"]["header"]["frame_id"] == "hall-2/force_1"
+    labels = {each["name"]: each["values"] for each in messages["/mocap/hall_2/labels"]["status"]}
+    assert labels["tools"] == [{"key": "Tool_1", "value": "Tool 1"}]
+    assert len(labels["markers"]) == 3
     assert messages["/diagnostics"]["status"][0]["name"].startswith("rtc3d_gateway: hall-2")
 
     assert {topic: types for topic, types in heard["topics"].items() if topic in TYPES} == {
@@ -99,7 +103,7 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
         [publisher] = heard["publishers"][topic]
         assert (publisher["node_name"], publisher["node_namespace"]) == ("rtc3d_gateway", "/mocap")
         assert publisher["type_hash"] == hashes[type_name]
-        is_latched = topic == "/tf_static"
+        is_latched = topic in {"/tf_static", "/mocap/hall_2/labels"}
         assert publisher["qos"].startswith(":1:,1:" if is_latched else "2::")
         numbers = [sequence for sequence, _, _ in heard["attachments"][topic]]
         assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]

@@ -17,7 +17,8 @@ TF: Final = "/tf"
 TF_STATIC: Final = "/tf_static"
 MARKERS: Final = "markers"
 ANALOG: Final = "analog"
-"""The topics of markers and channels, below that of their source."""
+LABELS: Final = "labels"
+"""The topics of markers, channels and labels, below that of their source."""
 
 _MAX_LABEL_CHARS: Final = 48
 MAX_PART_CHARS: Final = 63

@@ -11,6 +11,7 @@ from gateway.messages.encode import metres_per_unit
 from gateway.messages.foxglove.topics import FoxgloveTopic, TopicMessages
 from gateway.messages.ros2.definitions import definition
 from gateway.messages.ros2.encode import (
+    DIAGNOSTIC_ARRAY,
     FLOAT_ARRAY,
     POINT_CLOUD,
     POINT_STAMPED,
@@ -27,9 +28,11 @@ from gateway.messages.ros2.encode import (
     ros_stamps,
     tf_message,
 )
+from gateway.messages.ros2.labels import Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
     DEFAULT_NAMESPACE,
+    LABELS,
     MARKERS,
     MAX_PART_CHARS,
     TF,
@@ -83,9 +86,36 @@ class _RosExport(SourceExport):
         self._stamped = StampedEncoder(self._frame.frame_id)
         self._topics: dict[tuple[str, RosType], FoxgloveTopic] = {}
         self._placed_by: Parameters | None = None  # those that /tf_static follows
+        self._labels: Labels = {}  # of the newest message
 
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
         """Return the messages of a component; events are left out."""
+        found = [*self._values_of(key, run, rows)]
+        if any(each.messages for each in found):
+            yield from self._label_messages(run, int(run.capture_utime[rows][0]))
+        yield from found
+
+    def _label_messages(self, run: Series, utime: int) -> Iterable[TopicMessages]:
+        """Return the labels of all components so far, if those of a run are new.
+
+        Nodes keep the newest message only.
+        """
+        names: Sequence[str]
+        match run.component:
+            case ComponentType.TOOLS:
+                names = unique_ros_names(run.labels, "tool")
+            case ComponentType.FORCE:
+                names = [plate_name(number) for number in range(1, len(run.labels) + 1)]
+            case _:
+                names = [*by_index(run.labels)]
+        labels = dict(zip(names, run.labels, strict=False))
+        if labels != self._labels.get(run.component):
+            self._labels[run.component] = labels
+            encoded = labels_message(ros_stamp(utime), self._source, self._labels)
+            topic = self._topic(f"{self._base}/{LABELS}", DIAGNOSTIC_ARRAY)
+            yield TopicMessages(topic, [utime], [encoded])
+
+    def _values_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
         match key:
             case "3d":
                 return self._markers(run, rows)

@@ -16,9 +16,9 @@ from gateway.messages.ros2.encode import DIAGNOSTIC_ARRAY, TF_MESSAGE
 from gateway.messages.ros2.names import MAX_PART_CHARS, TF, ros_name
 from gateway.messages.topics import Topic, unique_name
 from gateway.outputs.adapters.ros2.diagnostics import DiagnosticsPublisher
+from gateway.outputs.adapters.ros2.latched import StaticTransforms
 from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.adapters.ros2.source import RosSource
-from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import FramePublisher, OutputHealth, Publisher, ServerParameters
 from gateway.outputs.frame_output import FrameOutput, in_this_loop

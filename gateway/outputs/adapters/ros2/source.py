@@ -11,11 +11,12 @@ import zenoh
 
 from gateway.errors import OutputError, raise_unless_defect
 from gateway.messages.encode import Stamp
-from gateway.messages.ros2.encode import ros_stamp
+from gateway.messages.ros2.encode import DIAGNOSTIC_ARRAY, ros_stamp
+from gateway.messages.ros2.names import LABELS
+from gateway.outputs.adapters.ros2.latched import LatchedTopic, StaticTransforms
 from gateway.outputs.adapters.ros2.settings import Tool
 from gateway.outputs.adapters.ros2.source_topics import NO_PARAMETERS, Messages, SourceTopics
 from gateway.outputs.adapters.ros2.stamps import DistinctStamps
-from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.zenoh.config import zenoh_reason
@@ -62,7 +63,12 @@ class RosSource:
         """Called in any thread."""
         self.losses = Losses(logger, f"{name} to ros2")
         """Where to count what cannot be published."""
-        self._topics = SourceTopics(name, base, tf, static, tools, self.update_wanted, lambda: self.losses)
+        self._labels = LatchedTopic(
+            f"{base}/{LABELS}", DIAGNOSTIC_ARRAY, lambda: self._sender.submit(self._labels.send)
+        )
+        self._topics = SourceTopics(
+            *(name, base, tf, static, self._labels, tools), self.update_wanted, lambda: self.losses
+        )
         self._router = router
         self._sender = sender
         self._sent = sent
@@ -84,7 +90,7 @@ class RosSource:
 
     @property
     def topics(self) -> tuple[RosTopic, ...]:
-        """All topics but /tf. Any thread may read it."""
+        """All topics but /tf and that of labels. Any thread may read it."""
         return self._topics.all
 
     @property
@@ -179,6 +185,7 @@ class RosSource:
     def check_subscribers(self) -> None:
         """Check again for subscribers."""
         self._topics.check_subscribers()
+        self._labels.check_subscribers()
         self.update_wanted()
 
     def _open_for(self, counts: Mapping[ComponentType, int], parameters: ServerParameters) -> None:

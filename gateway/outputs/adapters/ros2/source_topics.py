@@ -1,5 +1,6 @@
 """The topics of one source on ROS 2, and the messages that each frame becomes there."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
@@ -9,6 +10,7 @@ import numpy as np
 from gateway.messages.coordinate_frame import NO_ROTATION
 from gateway.messages.descriptions.labels import describe
 from gateway.messages.descriptions.source_frame import unknown_unit_text
+from gateway.messages.host_time import now_utime
 from gateway.messages.ros2.encode import (
     FLOAT_ARRAY,
     POINT_CLOUD,
@@ -23,8 +25,10 @@ from gateway.messages.ros2.encode import (
     pack_point,
     pack_pose,
     pack_wrench,
+    ros_stamp,
     tf_message,
 )
+from gateway.messages.ros2.labels import MAX_LABELS, Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
     MARKERS,
@@ -35,8 +39,8 @@ from gateway.messages.ros2.names import (
     wrench_topic,
 )
 from gateway.messages.ros2.plates import RosPlate, ros_plates, transforms_of
+from gateway.outputs.adapters.ros2.latched import LatchedTopic, StaticTransforms
 from gateway.outputs.adapters.ros2.settings import Tool
-from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import (
@@ -86,9 +90,9 @@ class SourceTopics:
     ``name`` is the source's name in the configuration, ``base`` the beginning of its topics: /mocap/lab.
     ``tf`` is the topic /tf, which all sources share, and ``static`` has /tf_static. There, frames of tools
     and plates begin with the source's name, so that they differ even if sources have one frame: lab/wand.
-    ``tools`` has those, by label, that are called otherwise or are left out.
-    ``on_wanted_changed`` is called in any thread when subscribers come or go, or topics. ``losses`` returns
-    where to count what cannot be published.
+    ``labels`` is the topic of labels; its subscribers need no frames. ``tools`` has those, by label, that are
+    called otherwise or are left out. ``on_wanted_changed`` is called in any thread when subscribers come or
+    go, or topics. ``losses`` returns where to count what cannot be published.
     """
 
     def __init__(
@@ -97,13 +101,14 @@ class SourceTopics:
         base: str,
         tf: RosTopic,
         static: StaticTransforms,
+        labels: LatchedTopic,
         tools: Mapping[str, Tool],
         on_wanted_changed: Callable[[], None],
         losses: Callable[[], Losses],
     ) -> None:
         # These three are replaced, not changed, because any thread may read them.
         self.all: tuple[RosTopic, ...] = ()
-        """All topics but /tf."""
+        """All topics but /tf and that of labels."""
         self.by_component: Mapping[ComponentType, Sequence[RosTopic]] = {ComponentType.TOOLS: (tf,)}
         """The topics on which each component is published."""
         self.names: Mapping[str, Mapping[str, str]] = {}
@@ -112,6 +117,8 @@ class SourceTopics:
         self._base = base
         self._tf = tf
         self._static = static
+        self._labels_topic = labels
+        self._labels: Labels = {}  # of the newest message
         self._settings = tools  # by label
         self._chosen_names = {label: tool.name for label, tool in tools.items() if tool and tool.name}
         self._on_wanted_changed = on_wanted_changed
@@ -124,6 +131,7 @@ class SourceTopics:
     def declare(self, node: RosNode) -> None:
         """Declare all topics, now and later, on an open session."""
         self._node = node
+        self._labels_topic.declare(node)
         for topic in self._by_name.values():
             topic.declare(node)
 
@@ -131,6 +139,7 @@ class SourceTopics:
         """Remove all topics from ROS."""
         for topic in self._by_name.values():
             topic.undeclare()
+        self._labels_topic.undeclare()
         self._static.set_transforms(self._source, ())
         self._by_name = {}
         self.by_component = {}
@@ -171,6 +180,7 @@ class SourceTopics:
         self._analog: RosTopic | None = None
         self._tools: list[_Tool | None] = []  # None is one that is left out
         self._plates: list[_Plate] = []
+        self._labels_now: Labels = {}
         self.names = {}
 
     def open(self, counts: Mapping[ComponentType, int]) -> None:
@@ -179,12 +189,18 @@ class SourceTopics:
             self._markers = self._topic(MARKERS, POINT_CLOUD)
         if counts.get(ComponentType.ANALOG):
             self._analog = self._topic(ANALOG, FLOAT_ARRAY)
+        for component in (ComponentType.MARKERS, ComponentType.ANALOG):
+            num_items = min(counts.get(component, 0), MAX_LABELS)
+            if num_items > len(self._labels_now.get(component, ())):
+                labels = describe(component, self._described_by.parsed, num_items).labels
+                self._labels_now[component] = by_index(labels)
         num_tools = min(counts.get(ComponentType.TOOLS, 0), MAX_TOOLS)
         if num_tools > len(self._tools):
             self._open_tools(num_tools)
         num_plates = min(counts.get(ComponentType.FORCE, 0), MAX_PLATES)
         if num_plates > len(self._plates):
             self._open_plates(num_plates)
+        self._publish_labels()
         self.all = tuple(self._by_name.values())
         self.by_component = {
             ComponentType.TOOLS: (self._tf, *(tool.topic for tool in self._tools if tool is not None)),
@@ -225,6 +241,15 @@ class SourceTopics:
     def _show_names(self, component: ComponentType, named: Sequence[tuple[str, str]]) -> None:
         changed = {label: name for label, name in named if name != label}
         self.names = {**self.names, component.key: changed}
+        self._labels_now[component] = {name: label for label, name in named}
+
+    def _publish_labels(self) -> None:
+        """Publish the labels if they have changed. Their stamp says since when they are valid."""
+        if self._labels_now != self._labels:
+            self._labels = dict(self._labels_now)
+            stamp = ros_stamp(now_utime())
+            encode = functools.partial(labels_message, stamp, self._source, self._labels)
+            self._labels_topic.set_message(functools.cache(encode) if self._labels else None)
 
     def _topic(self, name: str, ros_type: RosType) -> RosTopic:
         """Return the topic with this name: one that is open already, or a new one."""

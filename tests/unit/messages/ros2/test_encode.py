@@ -12,7 +12,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gateway.messages.ros2.definitions import definition
 from gateway.messages.ros2.encode import (
-    DIAGNOSTIC_ARRAY,
     ENCAPSULATION,
     ROS_TYPES,
     AnalogEncoder,
@@ -230,7 +229,7 @@ def test_rows_are_the_messages_of_each_row(utimes: list[int], frame_id: str, dat
     assert channels.encode_rows(values) == [channels.encode(each) for each in values]
 
 
-@pytest.mark.parametrize("ros_type", [each for each in ROS_TYPES if each is not DIAGNOSTIC_ARRAY])
+@pytest.mark.parametrize("ros_type", ROS_TYPES)
 def test_the_definitions_have_the_hashes_of_ros(ros_type: RosType) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(definition(ros_type), ros_type.name))

@@ -24,6 +24,7 @@ from tests.unit.takes.export.exported import NAN, export_messages, labelled, not
 SCENE = SyntheticScene(markers=3, tools=2, analog=3, plates=2, rate_hz=100, analog_rate_hz=200)
 TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
+    "/mocap/lab/labels": "diagnostic_msgs/msg/DiagnosticArray",
     "/mocap/lab/markers": "sensor_msgs/msg/PointCloud2",
     "/mocap/lab/Tool_1/pose": "geometry_msgs/msg/PoseStamped",
     "/mocap/lab/Tool_2/pose": "geometry_msgs/msg/PoseStamped",
@@ -117,6 +118,31 @@ def test_loads_act_at_the_centre_of_pressure_in_the_frame_of_their_plate(tmp_pat
             assert abs(arm[:2]).max() < 0.35  # on the plate
 
 
+def test_the_newest_labels_of_a_bag_are_those_of_all_components(tmp_path: Path) -> None:
+    """They are there before the first message that needs them, and again when they change."""
+    first, renamed = labelled("a", "b"), labelled("a", "c", version=2)
+    values = [(1.0, 2.0, 3.0, 0.0)] * 2
+    bag, _ = export(
+        *(tmp_path, first),
+        *(frame(ComponentType.MARKERS, values, n) for n in range(2)),
+        frame(ComponentType.TOOLS, [(1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.0)], 1),
+        renamed,
+        frame(ComponentType.MARKERS, values, 200, version=2),
+    )
+    found = [
+        (time_ns, {each.name: {pair.key: pair.value for pair in each.values} for each in message.status})
+        for time_ns, message in bag.messages["/mocap/lab/labels"]
+    ]
+    tools = {"tools": {"tool_1": "tool 1"}}
+    assert [labels for _, labels in found] == [
+        {"markers": {"0": "a", "1": "b"}},
+        {"markers": {"0": "a", "1": "b"}} | tools,
+        {"markers": {"0": "a", "1": "c"}} | tools,
+    ]
+    clouds = [time_ns for time_ns, _ in bag.messages["/mocap/lab/markers"]]
+    assert [time_ns for time_ns, _ in found][::2] == clouds[::2]
+
+
 def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     tools = Parameters(tools=Parameters6D(100.0, tuple(Tool(str(n), f"t{n}") for n in range(2))))
     seen, lost = (1.0, 0.0, 0.0, 0.0, 10.0, 20.0, 30.0, 0.5), (NAN,) * 8
@@ -130,6 +156,7 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     ]
     bag, job = export(tmp_path, parameters(tools), *messages)
     assert {topic: len(found) for topic, found in bag.messages.items()} == {
+        "/mocap/lab/labels": 2,
         "/mocap/lab/t0/pose": 1,
         "/tf": 1,
         "/mocap/lab/markers": 1,

@@ -10,9 +10,9 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.ros2.encode import TF_MESSAGE
+from gateway.outputs.adapters.ros2.latched import StaticTransforms
 from gateway.outputs.adapters.ros2.settings import Ros2Settings
 from gateway.outputs.adapters.ros2.source import RosSource
-from gateway.outputs.adapters.ros2.static_transforms import StaticTransforms
 from gateway.outputs.adapters.ros2.topic import RosTopic
 from gateway.outputs.contract import OutputHealth, ServerParameters
 from gateway.outputs.zenoh.confirmation import SentMessages
@@ -49,9 +49,9 @@ class Node:
 
     @property
     def open(self) -> set[str]:
-        """The topics that are declared now."""
+        """The topics that are declared now, without those of labels."""
         names = [event[1:] for event in self.events]
-        return {name for name in names if names.count(name) % 2}
+        return {name for name in names if names.count(name) % 2 and not name.endswith("/labels")}
 
 
 class _Declared:
@@ -186,9 +186,10 @@ class Source:
         self.publisher.declare(self.node)  # type: ignore[arg-type]
 
     def subscribe(self, *names: str, is_there: bool = True) -> None:
-        """Let subscribers come to these topics, or to all; or go."""
-        for topic in (self.tf, self.static._topic, *self.publisher.topics):
-            if not names or topic.name in names:
+        """Let subscribers come to these topics, or to all but that of labels; or go."""
+        labels = self.publisher._labels._topic
+        for topic in (self.tf, self.static._topic, labels, *self.publisher.topics):
+            if topic.name in (names or [topic.name]) and (names or topic is not labels):
                 topic._on_matching(is_there)
 
     def offer(self, frame: RawFrame, components: frozenset[ComponentType] = ALL) -> None:

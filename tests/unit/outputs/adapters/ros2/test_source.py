@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.ros2.labels import MAX_LABELS
 from gateway.outputs.adapters.ros2.source_topics import MAX_PLATES, MAX_TOOLS
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate, Point
@@ -54,7 +55,7 @@ def test_topics_that_belong_to_parameters_from_before_the_session_are_declared_w
     source.publisher.set_parameters(EACH)
     for _ in range(2):
         source.declare()
-        assert (len(source.node.open), len(source.node.events)) == (5, 5)
+        assert (len(source.node.open), len(source.node.events)) == (5, 6)  # with that of labels
 
 
 def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None:
@@ -333,6 +334,59 @@ def test_static_transforms_are_published_again_to_those_who_come_later() -> None
     assert source.sent["/tf_static"] == [1, 2, 3]
     source.use(parameters(version=3))
     assert "/tf_static" not in source.node.open
+
+
+def labels_of(cdr: bytes) -> dict[str, dict[str, str]]:
+    """Return the labels by component and by what stands for them in topics."""
+    array = ros.decoded(cdr, "diagnostic_msgs/msg/DiagnosticArray")
+    assert {each.hardware_id for each in array.status} == {"lab"}
+    return {each.name: {pair.key: pair.value for pair in each.values} for each in array.status}
+
+
+def test_labels_are_published_when_they_change_and_for_those_who_come_later() -> None:
+    """Points of a cloud have only an index, and names of tools in topics differ from their labels."""
+    plates = (Plate("1", "left"),)
+    given = parameters(("Left Foot", "cup"), markers=2, channels=("Fx",), plates=plates)
+    source = Source(given, tools={"cup": False})
+    sent, name = source.node.messages, "/mocap/lab/labels"
+    assert name not in sent
+    source.subscribe(name)
+    source.sender.run()
+    expected = {
+        "markers": {"0": "marker 1", "1": "marker 2"},
+        "tools": {"Left_Foot": "Left Foot"},
+        "analog": {"0": "Fx"},
+        "force": {"force_1": "left"},
+    }
+    assert [*map(labels_of, sent[name])] == [expected]
+    assert not source.publisher.wants(ALL)  # nobody needs frames for that
+    source.use(given._replace(version=2))
+    assert len(sent[name]) == 1  # nothing has changed
+    source.node.matching.add(name)
+    source.publisher.check_subscribers()
+    assert sent[name][1] == sent[name][0]
+    source.publisher.prepare(frame_of((MARKERS, [None] * 3), (ANALOG, [1.0])).layout, ALL)
+    source.sender.run()
+    expected["markers"]["2"] = "marker 3"
+    assert [*map(labels_of, sent[name][2:])] == [expected]
+    source.use(parameters(("cup",), version=3))
+    assert len(sent[name]) == 4
+    assert labels_of(sent[name][3]) == {"tools": {}}
+    source.use(parameters(version=4))
+    source.publisher.check_subscribers()
+    assert len(sent[name]) == 4
+    assert source.node.events[-1] == f"-{name}"
+
+
+def test_the_number_of_labels_is_bounded() -> None:
+    """A frame may have any number of markers."""
+    source = Source(parameters(markers=1))
+    source.publisher.prepare(frame_of((MARKERS, [None] * (MAX_LABELS + 1))).layout, ALL)
+    source.sender.run()
+    source.subscribe("/mocap/lab/labels")
+    source.sender.run()
+    [message] = source.node.messages["/mocap/lab/labels"]
+    assert len(labels_of(message)["markers"]) == MAX_LABELS
 
 
 def test_the_frames_of_plates_and_tools_differ() -> None:
