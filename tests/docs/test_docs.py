@@ -37,7 +37,7 @@ PROGRAM = "rtc3d-gateway"
 CLONE = ("git", "clone")
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
-OTHERS = {"/tf_static", "scrape_configs", "rule_files"}
+OTHERS = {"/tf_static", "/mocap/lab/labels", "scrape_configs", "rule_files"}
 """First keys of YAML for ROS, and for Prometheus, at which tests/integration/test_monitoring.py looks."""
 
 

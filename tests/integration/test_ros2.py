@@ -33,6 +33,7 @@ TYPES: Final = {
     "/mocap/hall_2/force_1/wrench": "geometry_msgs/msg/WrenchStamped",
     "/mocap/hall_2/force_1/centre_of_pressure": "geometry_msgs/msg/PointStamped",
     "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/mocap/hall_2/events": "diagnostic_msgs/msg/DiagnosticArray",
     "/mocap/hall_2/labels": "diagnostic_msgs/msg/DiagnosticArray",
 }
 """A topic of each type."""
@@ -90,6 +91,9 @@ async def test_another_implementation_receives_every_type_and_sees_the_graph(rou
     [plate] = messages["/tf_static"]["transforms"]
     assert (plate["header"]["frame_id"], plate["child_frame_id"]) == ("hall-2", "hall-2/force_1")
     assert messages["/mocap/hall_2/force_1/wrench"]["header"]["frame_id"] == "hall-2/force_1"
+    [event] = messages["/mocap/hall_2/events"]["status"]
+    assert event["name"] == "Button"
+    assert {pair["key"] for pair in event["values"]} > {"id"}
     labels = {each["name"]: each["values"] for each in messages["/mocap/hall_2/labels"]["status"]}
     assert labels["tools"] == [{"key": "Tool_1", "value": "Tool 1"}]
     assert len(labels["markers"]) == 3

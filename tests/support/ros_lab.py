@@ -22,11 +22,13 @@ from gateway.rtc3d.components import (
 from gateway.rtc3d.frames import RawFrame, encode_frame, split_frame
 from gateway.rtc3d.parameters import (
     AnalogChannel,
+    EventDefinition,
     Marker,
     Parameters,
     Parameters3D,
     Parameters6D,
     ParametersAnalog,
+    ParametersEvents,
     ParametersForce,
     Plate,
     Tool,
@@ -45,6 +47,7 @@ def parameters(
     markers: int = 0,
     channels: tuple[str, ...] = (),
     plates: tuple[Plate, ...] = (),
+    events: tuple[EventDefinition, ...] = (),
     unit: str = "mm",
     version: int = 1,
     frame: CoordinateFrame | None = None,
@@ -56,6 +59,7 @@ def parameters(
             channels=tuple(AnalogChannel(str(n), label) for n, label in enumerate(channels))
         ),
         force=ParametersForce(plates=plates),
+        events=ParametersEvents(events),
     )
     return ServerParameters(b"<xml/>", 1, version, parsed=parsed, frame=frame or CoordinateFrame("lab"))
 

@@ -17,8 +17,9 @@ TF: Final = "/tf"
 TF_STATIC: Final = "/tf_static"
 MARKERS: Final = "markers"
 ANALOG: Final = "analog"
+EVENTS: Final = "events"
 LABELS: Final = "labels"
-"""The topics of markers, channels and labels, below that of their source."""
+"""The topics of markers, channels, events and labels, below that of their source."""
 
 _MAX_LABEL_CHARS: Final = 48
 MAX_PART_CHARS: Final = 63

@@ -88,7 +88,7 @@ CHOSEN_FORMATS: Final = {
     "bids": Format(_imported_late("bids:export_bids")),
     "ros2": Format(
         _imported_late("rosbag:export_rosbag", *_FOXGLOVE),
-        ("3d", "6d", "analog", "force"),
+        ("3d", "6d", "analog", "force", "event"),
         lacks=_FOR_VIEWERS,
     ),
 }

@@ -8,7 +8,7 @@ import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import metres_per_unit
-from gateway.messages.foxglove.topics import FoxgloveTopic, TopicMessages
+from gateway.messages.foxglove.topics import MAX_UTIME, FoxgloveTopic, TopicMessages
 from gateway.messages.ros2.definitions import definition
 from gateway.messages.ros2.encode import (
     DIAGNOSTIC_ARRAY,
@@ -28,10 +28,12 @@ from gateway.messages.ros2.encode import (
     ros_stamps,
     tf_message,
 )
+from gateway.messages.ros2.events import event_message, event_utime
 from gateway.messages.ros2.labels import Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
     DEFAULT_NAMESPACE,
+    EVENTS,
     LABELS,
     MARKERS,
     MAX_PART_CHARS,
@@ -72,7 +74,7 @@ def export_rosbag(job: ExportJob) -> None:
             )
         return _RosExport(source, name)
 
-    export_to_mcap(job, new_export, "markers, tools, analog channels or forces", _PROFILE)
+    export_to_mcap(job, new_export, "markers, tools, analog channels, forces or events", _PROFILE)
 
 
 class _RosExport(SourceExport):
@@ -89,9 +91,9 @@ class _RosExport(SourceExport):
         self._labels: Labels = {}  # of the newest message
 
     def messages_of(self, key: str, run: Series, rows: Array) -> Iterable[TopicMessages]:
-        """Return the messages of a component; events are left out."""
+        """Return the messages of a component, and the labels before those that need them."""
         found = [*self._values_of(key, run, rows)]
-        if any(each.messages for each in found):
+        if run.labels and any(each.messages for each in found):
             yield from self._label_messages(run, int(run.capture_utime[rows][0]))
         yield from found
 
@@ -126,7 +128,7 @@ class _RosExport(SourceExport):
                 return [self._messages(ANALOG, FLOAT_ARRAY, run.capture_utime[rows], encoded)]
             case "force":
                 return self._forces(run, rows)
-        return ()
+        return [self._events(run, rows)]
 
     def labels_of(self, run: Series) -> Sequence[str]:
         """Return the names of topics of tools; other labels stay, or are in no message."""
@@ -195,6 +197,17 @@ class _RosExport(SourceExport):
             yield self._messages(wrench_topic(name), WRENCH_STAMPED, utimes, encoded)
             if frame is not None:
                 yield self._pressure(pressure_topic(name), frame, values, utimes)
+
+    def _events(self, run: Series, rows: Array) -> TopicMessages:
+        """Return the events, each with its own time."""
+        found = TopicMessages(self._topic(f"{self._base}/{EVENTS}", DIAGNOSTIC_ARRAY), [], [])
+        times = (run.capture_utime[rows], run.timestamp_us[rows], run.items["timestamp"][rows])
+        for row, *row_times in zip(rows.tolist(), *(each.tolist() for each in times), strict=True):
+            utime = min(max(event_utime(*row_times), 0), MAX_UTIME)
+            found.utimes.append(utime)
+            encoded = event_message(self._source, run.parameters_of(row), run.items[row], utime)
+            found.messages.append(encoded)
+        return found
 
     def _static_transforms(self, plates: Sequence[RosPlate], utime: int) -> Iterable[TopicMessages]:
         """Return where the plates are, if that is known."""

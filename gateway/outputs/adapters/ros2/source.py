@@ -11,7 +11,7 @@ import zenoh
 
 from gateway.errors import OutputError, raise_unless_defect
 from gateway.messages.encode import Stamp
-from gateway.messages.ros2.encode import DIAGNOSTIC_ARRAY, ros_stamp
+from gateway.messages.ros2.encode import DIAGNOSTIC_ARRAY
 from gateway.messages.ros2.names import LABELS
 from gateway.outputs.adapters.ros2.latched import LatchedTopic, StaticTransforms
 from gateway.outputs.adapters.ros2.settings import Tool
@@ -214,10 +214,10 @@ class RosSource:
         if refused is not self._skipped:
             self._skip(refused)
         self._topics.use(parameters)
-        time_stamp = ros_stamp(self._stamps.distinct(stamp.capture_utime, frame.layout, components))
+        utime = self._stamps.distinct(stamp.capture_utime, frame.layout, components)
         encoded: Messages = []
         try:
-            self._topics.encode(frame, time_stamp, components, encoded)
+            self._topics.encode(frame, utime, components, encoded)
         finally:
             self._put(encoded)
 

@@ -12,6 +12,7 @@ from gateway.messages.descriptions.labels import describe
 from gateway.messages.descriptions.source_frame import unknown_unit_text
 from gateway.messages.host_time import now_utime
 from gateway.messages.ros2.encode import (
+    DIAGNOSTIC_ARRAY,
     FLOAT_ARRAY,
     POINT_CLOUD,
     POINT_STAMPED,
@@ -28,9 +29,11 @@ from gateway.messages.ros2.encode import (
     ros_stamp,
     tf_message,
 )
+from gateway.messages.ros2.events import event_message, event_utime
 from gateway.messages.ros2.labels import MAX_LABELS, Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
+    EVENTS,
     MARKERS,
     plate_name,
     pose_topic,
@@ -47,6 +50,7 @@ from gateway.rtc3d.components import (
     COMPONENT_HEADER_BYTES,
     ITEM_DTYPES,
     ByteOrder,
+    Component,
     ComponentType,
     Items,
 )
@@ -56,6 +60,9 @@ from gateway.runtime.losses import Losses
 MAX_TOOLS: Final = 256
 MAX_PLATES: Final = 64
 """How many tools and plates can have topics of their own. The server determines how many there are."""
+
+MAX_EVENTS: Final = 256
+"""How many events of a frame are published: each becomes a message. Usually, there is one."""
 
 NO_PARAMETERS: Final = ServerParameters(b"", 0, 0, components=frozenset())
 """Stands for the parameters before the first are there."""
@@ -163,6 +170,7 @@ class SourceTopics:
                 ComponentType.TOOLS: len(parsed.tools.tools) if parsed.tools else 0,
                 ComponentType.ANALOG: len(parsed.analog.channels) if parsed.analog else 0,
                 ComponentType.FORCE: len(parsed.force.plates) if parsed.force else 0,
+                ComponentType.EVENT: len(parsed.events.events) if parsed.events else 0,
             }
         )
         for topic in self._former.values():
@@ -178,6 +186,7 @@ class SourceTopics:
         self._channels = AnalogEncoder(())
         self._markers: RosTopic | None = None
         self._analog: RosTopic | None = None
+        self._events: RosTopic | None = None
         self._tools: list[_Tool | None] = []  # None is one that is left out
         self._plates: list[_Plate] = []
         self._labels_now: Labels = {}
@@ -189,6 +198,8 @@ class SourceTopics:
             self._markers = self._topic(MARKERS, POINT_CLOUD)
         if counts.get(ComponentType.ANALOG):
             self._analog = self._topic(ANALOG, FLOAT_ARRAY)
+        if counts.get(ComponentType.EVENT):
+            self._events = self._topic(EVENTS, DIAGNOSTIC_ARRAY)
         for component in (ComponentType.MARKERS, ComponentType.ANALOG):
             num_items = min(counts.get(component, 0), MAX_LABELS)
             if num_items > len(self._labels_now.get(component, ())):
@@ -207,6 +218,7 @@ class SourceTopics:
             ComponentType.FORCE: tuple(topic for plate in self._plates for topic in plate.topics),
             ComponentType.MARKERS: () if self._markers is None else (self._markers,),
             ComponentType.ANALOG: () if self._analog is None else (self._analog,),
+            ComponentType.EVENT: () if self._events is None else (self._events,),
         }
         self._on_wanted_changed()  # a subscriber may have come before a topic was among them
 
@@ -265,12 +277,14 @@ class SourceTopics:
     # Frames.
 
     def encode(
-        self, frame: RawFrame, stamp: bytes, components: frozenset[ComponentType], encoded: Messages
+        self, frame: RawFrame, utime: int, components: frozenset[ComponentType], encoded: Messages
     ) -> None:
         """Append the messages of a frame to ``encoded``, on the topics that have subscribers.
 
-        If it raises an exception, those that are complete have been appended.
+        ``utime`` is when it was captured, in µs since the Unix epoch. If it raises an exception, those that
+        are complete have been appended.
         """
+        stamp = ros_stamp(utime)
         for index, layout in enumerate(frame.layout.components):
             kind = layout.type
             if kind not in components:
@@ -285,6 +299,8 @@ class SourceTopics:
                 self._encode_forces(_items(frame, index), stamp, encoded)
             elif kind is ComponentType.ANALOG and self._analog is not None and self._analog.wanted:
                 self._encode_analog(self._analog, _items(frame, index), encoded)
+            elif kind is ComponentType.EVENT and self._events is not None and self._events.wanted:
+                self._encode_events(self._events, frame.component(index), utime, encoded)
 
     def _encode_tools(self, items: Items, stamp: bytes, encoded: Messages) -> None:
         is_tf_wanted = self._tf.wanted
@@ -339,6 +355,17 @@ class SourceTopics:
             self._channels = AnalogEncoder(labels)
         encoded.append((topic, self._channels.encode(items)))
 
+    def _encode_events(self, topic: RosTopic, events: Component, utime: int, encoded: Messages) -> None:
+        """Append a message for each event, with the time of the event."""
+        items = events.items()
+        self._count_too_many("events", len(items), MAX_EVENTS)
+        has_times = "timestamp" in (items.dtype.names or ())
+        for event in items[:MAX_EVENTS]:
+            event_us = int(event["timestamp"]) if has_times else events.timestamp_us
+            happened_utime = event_utime(utime, events.timestamp_us, event_us)
+            message = event_message(self._source, self._described_by.parsed, event, happened_utime)
+            encoded.append((topic, message))
+
     def _count_unknown_unit(self, kind: ComponentType) -> None:
         num_messages = sum(topic.wanted for topic in self.by_component.get(kind, ()))
         if num_messages:
@@ -347,7 +374,7 @@ class SourceTopics:
 
     def _count_too_many(self, noun: str, count: int, most: int) -> None:
         if count > most:
-            text = f"a frame has {count} {noun}; only the first {most} have topics"
+            text = f"a frame has {count} {noun}; only the first {most} are published"
             self._losses().lost(f"too many {noun}", text, messages=count - most)
 
 

@@ -227,7 +227,7 @@ MARKERS_ONLY = SyntheticScene(markers=2, tools=0, analog=0, plates=0, rate_hz=10
         (
             "ros2",
             [*some(MARKERS_ONLY), frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])],
-            "events, frame numbers, server's time stamps",
+            "frame numbers, server's time stamps",
         ),
         ("bids", [details("Ada"), *some(LEFT)], ""),
     ],

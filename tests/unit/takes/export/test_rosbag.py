@@ -12,7 +12,17 @@ from rosbags.highlevel import AnyReader
 from gateway.errors import SelectionError, TakeError
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import ForceChannel, Parameters, Parameters6D, ParametersForce, Plate, Tool
+from gateway.rtc3d.parameters import (
+    EventDefinition,
+    EventParameter,
+    ForceChannel,
+    Parameters,
+    Parameters6D,
+    ParametersEvents,
+    ParametersForce,
+    Plate,
+    Tool,
+)
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.takes import open_take
 from gateway.takes.export.job import ExportJob, export_take
@@ -143,6 +153,26 @@ def test_the_newest_labels_of_a_bag_are_those_of_all_components(tmp_path: Path) 
     assert [time_ns for time_ns, _ in found][::2] == clouds[::2]
 
 
+def test_events_have_their_own_times_names_and_parameters(tmp_path: Path) -> None:
+    """The label is that of the parameters at the time; an event may be a message after its frame's time."""
+    named = EventDefinition("7", "Left foot strike", parameters=(EventParameter("1", "int", "Side"),))
+    described = parameters(Parameters(events=ParametersEvents((named,))))
+    early, odd = (7, 995_000, 2, -1, -1), (8, -5_000_000, -1, -1, 3)
+    bag, _ = export(
+        tmp_path, described, frame(ComponentType.EVENT, [early, odd], 100, timestamp_us=1_000_000)
+    )
+    assert [*bag.types] == ["/mocap/lab/events"]
+    found = bag.messages["/mocap/lab/events"]
+    (first_ns, first), (second_ns, second) = found
+    assert second_ns - first_ns == 5_000_000  # the time stamp of the other one is implausible
+    for time_ns, message in found:
+        assert 10**9 * message.header.stamp.sec + message.header.stamp.nanosec == time_ns
+    [[status], [unknown]] = first.status, second.status
+    values = {pair.key: pair.value for pair in status.values}
+    assert (status.name, status.hardware_id, values) == ("Left foot strike", "lab", {"id": "7", "Side": "2"})
+    assert (unknown.name, unknown.message) == ("event 8", "param3: 3")
+
+
 def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
     tools = Parameters(tools=Parameters6D(100.0, tuple(Tool(str(n), f"t{n}") for n in range(2))))
     seen, lost = (1.0, 0.0, 0.0, 0.0, 10.0, 20.0, 30.0, 0.5), (NAN,) * 8
@@ -151,7 +181,6 @@ def test_what_is_missing_is_in_no_message_or_nan(tmp_path: Path) -> None:
         frame(ComponentType.TOOLS, [lost, lost], 1),
         frame(ComponentType.MARKERS, [(1.0, 2.0, 3.0, 0.0), (NAN, 2.0, 3.0, 0.0)], 0),
         frame(ComponentType.FORCE, [(1.0, 2.0, 3.0, 4.0, 5.0, NAN)], 0),
-        frame(ComponentType.EVENT, [(1, 0, 0, 0, 0)], 0),
         frame(ComponentType.ANALOG, [1.0], 0, utime=-START_UTIME),
     ]
     bag, job = export(tmp_path, parameters(tools), *messages)
@@ -193,7 +222,7 @@ def test_units_of_plates_are_converted_and_unknown_lengths_left_out(tmp_path: Pa
 def test_a_bag_of_another_format_or_of_nothing_is_refused(tmp_path: Path) -> None:
     with raises(SelectionError, "out.c3d", ".mcap"):
         export_messages(tmp_path, [labelled("a")], "out.c3d", format="ros2")
-    with raises(TakeError, "markers, tools, analog channels or forces"):
+    with raises(TakeError, "markers, tools, analog channels, forces or events"):
         export_messages(tmp_path, [labelled("a")], "out.mcap", format="ros2")
     assert not (tmp_path / "out.mcap").exists()
 

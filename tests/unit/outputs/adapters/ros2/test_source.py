@@ -14,14 +14,15 @@ from hypothesis import strategies as st
 
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.ros2.labels import MAX_LABELS
-from gateway.outputs.adapters.ros2.source_topics import MAX_PLATES, MAX_TOOLS
-from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
-from gateway.rtc3d.parameters import ForceChannel, Plate, Point
+from gateway.outputs.adapters.ros2.source_topics import MAX_EVENTS, MAX_PLATES, MAX_TOOLS
+from gateway.rtc3d.components import SHORT_EVENT, WIRE_ORDER, ByteOrder, ComponentType, encode_component
+from gateway.rtc3d.frames import encode_frame, split_frame
+from gateway.rtc3d.parameters import EventDefinition, ForceChannel, Plate, Point
 from tests.support import ros_messages as ros
 from tests.support.ros_lab import ALL, ONE_TOOL, UTIME, frame_of, parameters, stamp, tools_frame
 from tests.unit.outputs.adapters.ros2.scripted_ros import Source, cause_of
 
-MARKERS, TOOLS, ANALOG, FORCE, _ = WIRE_ORDER
+MARKERS, TOOLS, ANALOG, FORCE, EVENT = WIRE_ORDER
 LOAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 NAN = float("nan")
 ONE_MARKER = frame_of((MARKERS, [(1, 2, 3, 0)]))
@@ -392,6 +393,40 @@ def test_the_number_of_labels_is_bounded() -> None:
 def test_the_frames_of_plates_and_tools_differ() -> None:
     source = Source(parameters(("force_1",), plates=(placed_plate(0, 0),)))
     assert {"/mocap/lab/tool_force_1/pose", "/mocap/lab/force_1/wrench"} < source.node.open
+
+
+def test_events_have_names_and_their_own_times() -> None:
+    """A node must not have to know the ids of the server. Their frame has the time stamp 1000 µs."""
+    source = Source(parameters(events=(EventDefinition("7", "Trigger"),)))
+    assert source.node.open == {"/tf", "/mocap/lab/events"}
+    source.subscribe()
+    source.send(frame_of((EVENT, [(7, 800, 1, -1, -1), (8, 1 << 40, -1, -1, -1)])))
+    found = [
+        ros.decoded(cdr, "diagnostic_msgs/msg/DiagnosticArray")
+        for cdr in source.node.messages["/mocap/lab/events"]
+    ]
+    assert [each.header for each in found] == [ros.header(UTIME - 200, ""), ros.header(UTIME, "")]
+    assert [each.status[0].name for each in found] == ["Trigger", "event 8"]
+    assert [(pair.key, pair.value) for pair in found[0].status[0].values] == [("id", "7"), ("param1", "1")]
+    short = np.array([(7, 1, -1, -1)], SHORT_EVENT)
+    source.send(
+        split_frame(encode_frame([encode_component(EVENT, 7, 1000, short, "little")], "little"), "little")
+    )
+    newest = ros.decoded(source.node.messages["/mocap/lab/events"][2], "diagnostic_msgs/msg/DiagnosticArray")
+    assert (newest.header, newest.status[0].name) == (ros.header(UTIME + 1, ""), "Trigger")
+
+
+def test_events_without_a_description_open_their_topic_and_are_bounded() -> None:
+    source = Source(parameters())
+    event = (7, 1000, -1, -1, -1)
+    source.publisher.prepare(frame_of((EVENT, [event])).layout, ALL)
+    source.sender.run()
+    assert not source.publisher.wants(ALL)
+    source.subscribe("/mocap/lab/events")
+    assert source.publisher.wants([EVENT])
+    source.send(frame_of((EVENT, [event] * (MAX_EVENTS + 2))))
+    assert len(source.sent["events"]) == MAX_EVENTS
+    assert source.lost == {"too many events": (2, 1)}
 
 
 @pytest.mark.parametrize("counts", [(3, 1, 2), (0, 2)])
