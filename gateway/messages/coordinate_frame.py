@@ -135,6 +135,19 @@ def _is_complete(pose: Pose, accept_zeros: bool) -> bool:
     return accept_zeros or any(pose[3:7])
 
 
+def with_offset(pose: Pose, translation_m: Vector, rotation_xyzw: Quaternion) -> Pose:
+    """Return the pose of a frame that is moved and then rotated in the frame of ``pose``.
+
+    Its quaternion need not have the length 1.
+    """
+    x, y, z, qx, qy, qz, qw, error_m = pose
+    rotation = (qx, qy, qz, qw)
+    squares = qx * qx + qy * qy + qz * qz + qw * qw
+    dx, dy, dz, _ = product(product(rotation, (*translation_m, 0.0)), (-qx, -qy, -qz, qw))
+    turned = product(rotation, rotation_xyzw)
+    return (x + dx / squares, y + dy / squares, z + dz / squares, *turned, error_m)
+
+
 def product(first: Quaternion, second: Quaternion) -> Quaternion:
     """Return the rotation by ``second``, then by ``first``."""
     x1, y1, z1, w1 = first

@@ -20,7 +20,7 @@ def source_frame(settings: SourceSettings, parameters: Parameters) -> Coordinate
     transform = settings.transform
     unit = transform.units or parameters.length_unit
     metres = metres_per_unit(unit)
-    rotation = transform.rotation_xyzw or _quaternion(transform.rotation_deg)
+    rotation = transform.rotation_xyzw or quaternion_of(transform.rotation_deg)
     if transform.up == "y":
         rotation = product(rotation, _Y_UP_TO_Z_UP)
     return CoordinateFrame(
@@ -40,7 +40,7 @@ def unknown_unit_text(parameters: Parameters, what: str = "positions") -> str:
     )
 
 
-def _quaternion(angles: RollPitchYaw) -> Quaternion:
+def quaternion_of(angles: RollPitchYaw) -> Quaternion:
     """Return the rotation by roll about x, then pitch about y, then yaw about z, all of them fixed axes."""
     roll, pitch, yaw = (math.radians(angle) / 2 for angle in (angles.roll, angles.pitch, angles.yaw))
     about_x = (math.sin(roll), 0.0, 0.0, math.cos(roll))

@@ -5,9 +5,9 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, TypeAdapter, WrapValidator, model_validator
 
-from gateway.config.section import Section, expects, validation_errors
+from gateway.config.section import Section, expects, validation_error, validation_errors
 from gateway.config.settings import OutputSettings
-from gateway.config.values import FrameId, SourceName, Switch
+from gateway.config.values import FrameId, Metres3, QuaternionXyzw, RollPitchYaw, SourceName, Switch
 from gateway.messages.ros2.names import DEFAULT_NAMESPACE, MAX_PART_CHARS, PLATE_NAME
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.outputs.kind import OutputKind, imported_late
@@ -75,14 +75,36 @@ ToolName = Annotated[
 ]
 
 
+class OffsetSettings(Section):
+    """Where the published frame of a tool is in the tool's own frame: first moved, then rotated."""
+
+    translation_m: Metres3 = (0.0, 0.0, 0.0)
+    """Its origin, in metres along the axes of the tool."""
+
+    rotation_xyzw: QuaternionXyzw | None = None
+    """Its rotation, as a quaternion."""
+
+    rotation_deg: RollPitchYaw = RollPitchYaw()
+    """Its rotation, as angles. Only one of the two can be given."""
+
+    @model_validator(mode="after")
+    def _check_rotation(self) -> Self:
+        if self.rotation_xyzw is not None and self.rotation_deg != RollPitchYaw():
+            raise validation_error("found rotation_xyzw, too; expected one of the two", "rotation_deg")
+        return self
+
+
 class ToolSettings(Section):
-    """What a tool is called on ROS 2, if that is not its label."""
+    """What a tool is called on ROS 2, if that is not its label, and which frame of it is published."""
 
     name: ToolName | None = None
     """Its name in topics, for example /mocap/lab/hand/pose. null means its label."""
 
     child_frame: FrameId | None = None
     """Its frame on /tf. null means SOURCE/NAME, for example lab/hand."""
+
+    offset: OffsetSettings = OffsetSettings()
+    """Where the published frame is in the tool's own frame."""
 
 
 _TOOL_SETTINGS: Final = TypeAdapter(ToolSettings)

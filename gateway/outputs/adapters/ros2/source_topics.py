@@ -7,9 +7,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.messages.coordinate_frame import NO_ROTATION
+from gateway.messages.coordinate_frame import NO_ROTATION, Quaternion, Vector, with_offset
 from gateway.messages.descriptions.labels import describe
-from gateway.messages.descriptions.source_frame import unknown_unit_text
+from gateway.messages.descriptions.source_frame import quaternion_of, unknown_unit_text
 from gateway.messages.host_time import now_utime
 from gateway.messages.ros2.encode import (
     DIAGNOSTIC_ARRAY,
@@ -43,7 +43,7 @@ from gateway.messages.ros2.names import (
 )
 from gateway.messages.ros2.plates import RosPlate, ros_plates, transforms_of
 from gateway.outputs.adapters.ros2.latched import LatchedTopic, StaticTransforms
-from gateway.outputs.adapters.ros2.settings import Tool
+from gateway.outputs.adapters.ros2.settings import OffsetSettings, Tool
 from gateway.outputs.adapters.ros2.topic import RosNode, RosTopic
 from gateway.outputs.contract import ServerParameters
 from gateway.rtc3d.components import (
@@ -79,6 +79,14 @@ Messages = list[tuple[RosTopic, bytes]]
 class _Tool(NamedTuple):
     topic: RosTopic
     names: TransformNames
+    offset: tuple[Vector, Quaternion] | None  # None costs nothing
+
+
+def _offset_of(tool: Tool | None) -> tuple[Vector, Quaternion] | None:
+    if not tool or tool.offset == OffsetSettings():
+        return None
+    offset = tool.offset
+    return offset.translation_m, offset.rotation_xyzw or quaternion_of(offset.rotation_deg)
 
 
 class _Plate(NamedTuple):
@@ -237,7 +245,7 @@ class SourceTopics:
         tool = self._settings.get(label)
         child_frame = (tool and tool.child_frame) or f"{self._source}/{name}"
         topic = self._topic(pose_topic(name), POSE_STAMPED)
-        return _Tool(topic, TransformNames(self._frame.frame_id, child_frame))
+        return _Tool(topic, TransformNames(self._frame.frame_id, child_frame), _offset_of(tool))
 
     def _open_plates(self, num_plates: int) -> None:
         parsed = self._described_by.parsed
@@ -313,7 +321,9 @@ class SourceTopics:
         for tool, pose in zip(self._tools, poses, strict=False):  # a frame can have fewer tools
             if pose is None or tool is None:  # out of view, or left out
                 continue
-            topic, names = tool
+            topic, names, offset = tool
+            if offset is not None:
+                pose = with_offset(pose, *offset)  # noqa: PLW2901 - as the frame of the tool is published
             content = pack_pose(*pose[:7])
             transforms.append((names, content))
             if topic.wanted:

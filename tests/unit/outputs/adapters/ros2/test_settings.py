@@ -37,6 +37,11 @@ def test_tools_are_renamed_or_left_out_by_source_and_label() -> None:
         ({"lab": {"a": HAND, "b": HAND}}, "tools.lab.b.name"),
         ({"lab": {"a": LINK}, "hall": {"a": LINK}}, "tools.hall.a.child_frame"),
         ({"lab": {"a": True}}, "tools.lab.a"),
+        ({"lab": {"a": {"offset": {"translation_m": [1, 2]}}}}, "tools.lab.a.offset.translation_m"),
+        (
+            {"lab": {"a": {"offset": {"rotation_xyzw": [0, 0, 0, 1], "rotation_deg": {"yaw": 1}}}}},
+            "tools.lab.a.offset.rotation_deg",
+        ),
         ({"lab": {"a": None}}, "tools.lab.a"),
         ({"lab": {"a": {"nmae": "hand"}}}, "tools.lab.a.nmae"),
         ({"lab": {"": HAND}}, "tools.lab"),

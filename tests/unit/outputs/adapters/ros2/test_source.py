@@ -145,6 +145,25 @@ def test_tools_have_the_names_and_frames_of_the_settings_and_some_are_left_out()
     assert "/mocap/lab/tool_5/pose" in source.node.open
 
 
+def test_an_offset_is_in_the_frame_of_the_tool() -> None:
+    """A marker cluster sits on a robot's hand: 0.1 m in x from its flange, and a quarter turn about z.
+
+    The tool is turned by 90° about x: its y is the z of the source. Its quaternion is not quite normal.
+    """
+    half = math.sqrt(0.5)
+    offset = {"translation_m": [0.1, 0.2, 0.0], "rotation_deg": {"yaw": 90}}
+    source = Source(parameters(("wand", "cup")), tools={"wand": {"offset": offset}})
+    source.subscribe()
+    item = (1.01 * half, 1.01 * half, 0.0, 0.0, 1000.0, 0.0, 0.0, 0.1)
+    source.send(frame_of((TOOLS, [item, item])))
+    [moved, kept] = source.message("/tf", "tf2_msgs/msg/TFMessage").transforms
+    pose = source.message("wand/pose", "geometry_msgs/msg/PoseStamped").pose
+    for p, q in ((pose.position, pose.orientation), (moved.transform.translation, moved.transform.rotation)):
+        assert (p.x, p.y, p.z) == pytest.approx((1.1, 0.0, 0.2), abs=1e-6)
+        assert (q.x, q.y, q.z, q.w) == pytest.approx((0.505, -0.505, 0.505, 0.505), abs=1e-6)
+    assert kept.transform.translation.x == 1.0
+
+
 # What is wanted -----------------------------------------------------------------------------
 
 
