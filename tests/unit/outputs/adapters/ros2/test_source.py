@@ -398,6 +398,38 @@ def test_labels_are_published_when_they_change_and_for_those_who_come_later() ->
     assert source.node.events[-1] == f"-{name}"
 
 
+steps = st.tuples(st.sampled_from(["parameters", "frame", "come", "go"]), st.integers(0, 3))
+
+
+@given(st.lists(steps, max_size=20))
+def test_who_subscribes_has_the_newest_labels_whatever_came_before(steps: list[tuple[str, int]]) -> None:
+    """Compared with the number of markers that parameters and frames have mentioned."""
+    source, name, num_markers = Source(), "/mocap/lab/labels", 0
+    for version, (step, count) in enumerate(steps):
+        match step:
+            case "parameters":
+                source.use(parameters(markers=count, version=version))
+                num_markers = count
+            case "frame":
+                source.publisher.prepare(frame_of((MARKERS, [None] * count)).layout, ALL)
+                source.sender.run()
+                num_markers = max(num_markers, count)
+            case "come":
+                source.node.matching.add(name)
+            case "go":
+                source.node.matching.discard(name)
+        num_before = len(source.node.messages.get(name, ()))
+        source.publisher.check_subscribers()
+        source.sender.run()
+        sent = source.node.messages.get(name, [])
+        assert (len(sent) > num_before) is (name in source.node.matching and num_markers > 0)
+        if len(sent) > num_before:
+            expected = {str(index): f"marker {index + 1}" for index in range(num_markers)}
+            assert labels_of(sent[-1]) == {"markers": expected}
+        declared = [event for event in source.node.events if event.endswith(name)]
+        assert len(declared) % 2 == (num_markers > 0)
+
+
 def test_the_number_of_labels_is_bounded() -> None:
     """A frame may have any number of markers."""
     source = Source(parameters(markers=1))
@@ -542,6 +574,7 @@ def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
     assert not source.publisher.wants(ALL)
     source.sender.run()
     assert (source.sent, source.node.open, source.publisher.topics) == ({}, {"/tf"}, ())
+    assert source.node.events[-1] == "-/mocap/lab/labels"
     source.subscribe()
     source.publisher.update_wanted()
     assert not source.publisher.wants(ALL)
