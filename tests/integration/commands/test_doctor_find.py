@@ -16,6 +16,7 @@ from gateway.tools.doctor.search import Found, SearchResult, parse_hosts, result
 from tests.support.commands import run, run_in_process
 from tests.support.errors import names
 from tests.support.gateway_process import PROGRAM
+from tests.support.needs import need_ipv6
 from tests.support.pseudo_terminals import in_terminal
 from tests.support.servers import Client, Script, ScriptedServer, error, markers_frame, ok
 
@@ -212,6 +213,7 @@ async def test_a_name_is_tried_at_each_of_its_addresses(monkeypatch: pytest.Monk
 
 
 async def test_the_next_command_can_be_pasted_into_a_shell() -> None:
+    need_ipv6()
     async with ScriptedServer(rt_server, 3020, "::1"), ScriptedServer(rt_server, 3030, "127.0.0.2"):
         lines = list(result_lines(await found_on("::1,127.0.0.2")))
     commands = [shlex.split(line) for line in lines if line.startswith(" ")]
