@@ -55,7 +55,8 @@ _TEXTS: Final = {
 }
 _NOTE: Final = (
     "The whole process, with its libraries' threads and its children. LCM sends without a peer, too. "
-    "ROS 2 makes up to 15 messages of a frame, one of them for each of 10 tools; the relay makes five."
+    "ROS 2 makes one message for each of 10 tools, and one for each event and plate; the relay makes five in "
+    "all."
 )
 
 ROS2_POSES: Final = "ros2_poses_us"
