@@ -155,8 +155,21 @@ def cut(text: str, max_bytes: int) -> str:
 UNUSED: Final = -1
 """An event's parameter that is not used (0xFFFFFFFF)."""
 
+EVENT_VALUES: Final = ("id", "param1", "param2", "param3")
+"""The fields of an event that its text is made of."""
+
 MAX_EVENT_AGE_US: Final = 1_000_000
 """An event's own time stamp is used if it is as near as this to that of its frame."""
+
+
+def event_time_us(frame_us: int, timestamp_us: int, event_us: int) -> int:
+    """Return when an event happened, in µs on the clock of ``frame_us``, the time of its frame.
+
+    ``timestamp_us`` and ``event_us`` are the server's time stamps of the frame and of the event, which may be
+    earlier or later (field note 6). If it is implausible, the event has the time of the frame.
+    """
+    delay_us = event_us - timestamp_us
+    return frame_us + delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else frame_us
 
 
 class EventText(NamedTuple):

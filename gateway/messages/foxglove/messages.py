@@ -24,7 +24,13 @@ from foxglove.messages import (
 
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import json_text
-from gateway.messages.descriptions.labels import MAX_EVENT_AGE_US, describe, event_labels, event_text
+from gateway.messages.descriptions.labels import (
+    EVENT_VALUES,
+    describe,
+    event_labels,
+    event_text,
+    event_time_us,
+)
 from gateway.messages.encode import metres_per_unit
 from gateway.messages.foxglove.plates import NO_POSE, PlateScene
 from gateway.messages.foxglove.topics import (
@@ -67,9 +73,6 @@ NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: len(_LO
 
 _MAX_LAYOUTS: Final = 100
 """How many different numbers of items of one component are remembered."""
-
-_EVENT_VALUES: Final = ("id", "param1", "param2", "param3")
-"""The fields of an event that its message is made of."""
 
 _MAX_EVENTS: Final = 100
 """How many messages of events are remembered: the same button is pressed again and again."""
@@ -297,14 +300,12 @@ class FoxgloveSource:
         messages: list[bytes] = []
         frames: list[int] = []
         own_us = items["timestamp"].tolist()
-        values = items[[*_EVENT_VALUES]].tolist()
+        values = items[[*EVENT_VALUES]].tolist()
         for frame, (capture_utime, timestamp_us) in enumerate(
             zip(capture_utimes, timestamps_us, strict=True)
         ):
             for event_us, event in zip(own_us[frame], values[frame], strict=True):
-                delay_us = timestamp_us - event_us
-                utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
-                utime = min(max(utime, 0), MAX_UTIME)
+                utime = min(max(event_time_us(capture_utime, timestamp_us, event_us), 0), MAX_UTIME)
                 time, message = timestamp(utime), self._event_message(*event)
                 log = Log(timestamp=time, level=LogLevel.Info, message=message, name=self.source)
                 utimes.append(utime)
@@ -313,7 +314,7 @@ class FoxgloveSource:
         return TopicMessages(self._fixed.events, utimes, messages, frames)
 
     def _find_event_message(self, *values: int) -> str:
-        text = event_text(self._parameters, dict(zip(_EVENT_VALUES, values, strict=True)))
+        text = event_text(self._parameters, dict(zip(EVENT_VALUES, values, strict=True)))
         return f"{text.label} ({text.description})" if text.description else text.label
 
     def _find_labels(self, component: ComponentType, num_items: int) -> tuple[str, ...]:

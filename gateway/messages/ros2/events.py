@@ -2,22 +2,11 @@
 
 from typing import Any, Final
 
-from gateway.messages.descriptions.labels import MAX_EVENT_AGE_US, event_text
+from gateway.messages.descriptions.labels import event_text
 from gateway.messages.ros2.encode import DiagnosticStatus, diagnostic_array, ros_stamp
 from gateway.rtc3d.parameters import Parameters
 
 _OK: Final = 0
-
-
-def event_utime(capture_utime: int, timestamp_us: int, event_us: int) -> int:
-    """Return when an event happened, in µs since the Unix epoch.
-
-    ``capture_utime`` is the time of its frame. ``timestamp_us`` and ``event_us`` are the server's time stamps
-    of the frame and of the event, which may be earlier or later (field note 6). If it is implausible, the
-    event has the time of the frame.
-    """
-    delay_us = timestamp_us - event_us
-    return capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
 
 
 def event_message(source: str, parameters: Parameters, event: Any, utime: int) -> bytes:

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.descriptions.labels import event_time_us
 from gateway.messages.encode import metres_per_unit
 from gateway.messages.foxglove.topics import MAX_UTIME, FoxgloveTopic, TopicMessages
 from gateway.messages.ros2.definitions import definition
@@ -28,7 +29,7 @@ from gateway.messages.ros2.encode import (
     ros_stamps,
     tf_message,
 )
-from gateway.messages.ros2.events import event_message, event_utime
+from gateway.messages.ros2.events import event_message
 from gateway.messages.ros2.labels import Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
@@ -105,7 +106,7 @@ class _RosExport(SourceExport):
         names: Sequence[str]
         match run.component:
             case ComponentType.TOOLS:
-                names = unique_ros_names(run.labels, "tool")
+                names = self.labels_of(run)
             case ComponentType.FORCE:
                 names = [plate_name(number) for number in range(1, len(run.labels) + 1)]
             case _:
@@ -156,7 +157,7 @@ class _RosExport(SourceExport):
         if frame.metres_per_unit is None:
             self.count(f"tools with the unknown unit {run.unit!r}", rows >= 0)
             return []
-        tools = unique_ros_names(run.labels, "tool")
+        tools = self.labels_of(run)
         names = [TransformNames(frame.frame_id, f"{self._source}/{tool}") for tool in tools]
         topics = [self._topic(f"{self._base}/{pose_topic(tool)}", POSE_STAMPED) for tool in tools]
         found = [TopicMessages(topic, [], []) for topic in topics]
@@ -203,7 +204,7 @@ class _RosExport(SourceExport):
         found = TopicMessages(self._topic(f"{self._base}/{EVENTS}", DIAGNOSTIC_ARRAY), [], [])
         times = (run.capture_utime[rows], run.timestamp_us[rows], run.items["timestamp"][rows])
         for row, *row_times in zip(rows.tolist(), *(each.tolist() for each in times), strict=True):
-            utime = min(max(event_utime(*row_times), 0), MAX_UTIME)
+            utime = min(max(event_time_us(*row_times), 0), MAX_UTIME)
             found.utimes.append(utime)
             encoded = event_message(self._source, run.parameters_of(row), run.items[row], utime)
             found.messages.append(encoded)

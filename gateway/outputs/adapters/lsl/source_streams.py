@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.messages.coordinate_frame import MAX_FLOAT, NO_ROTATION, CoordinateFrame, product
-from gateway.messages.descriptions.labels import MAX_EVENT_AGE_US, event_text, printable
+from gateway.messages.descriptions.labels import EVENT_VALUES, event_text, event_time_us, printable
 from gateway.messages.descriptions.source_frame import unknown_unit_text
 from gateway.messages.encode import Stamp
 from gateway.outputs.adapters.lsl.process import Kind, Message, opening_content, samples_content
@@ -101,9 +101,6 @@ _MAX_APART_US: Final = 1_000_000
 """Components of one frame have time stamps as near as this, or these are not those of one clock."""
 
 _ITEMS_OFFSET: Final = 16  # of the items in a component's content
-_EVENT_VALUES: Final = ("id", "param1", "param2", "param3")
-"""The fields of an event that its text is made of."""
-
 _MAX_EVENT_TEXTS: Final = 100
 """How many texts are remembered: the same button is pressed again and again."""
 
@@ -333,22 +330,20 @@ class SourceStreams:
         dtype = frames[0].frame.component(index).items().dtype
         data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in frames])
         items = np.frombuffer(data, dtype)
-        # An event may have happened later than its component, or earlier (field note 6).
         own_us = items["timestamp"].tolist() if "timestamp" in (dtype.names or ()) else [None] * len(items)
         times_us = _times_us(frames, index, suspended_us)
         of_items = (time for time in times_us for _ in range(layout.components[index].num_items))
         times_s = []
         for (component_us, timestamp_us), event_us in zip(of_items, own_us, strict=True):
-            delay_us = 0 if event_us is None else event_us - timestamp_us
-            is_plausible = abs(delay_us) <= MAX_EVENT_AGE_US
-            times_s.append((component_us + (delay_us if is_plausible else 0)) / 1e6)
-        texts = [self._event_text(*values) for values in items[[*_EVENT_VALUES]].tolist()]
+            event_us = timestamp_us if event_us is None else event_us  # noqa: PLW2901 - as the frame says
+            times_s.append(event_time_us(component_us, timestamp_us, event_us) / 1e6)
+        texts = [self._event_text(*values) for values in items[[*EVENT_VALUES]].tolist()]
         message = Message(Kind.TEXTS, stream.number, json.dumps((times_s, texts)).encode())
         if texts and not self._send(message):
             self._count_loss("not open", NOT_OPEN, len(frames))
 
     def _find_event_text(self, *values: int) -> str:
-        text = event_text(self._described.parameters, dict(zip(_EVENT_VALUES, values, strict=True)))
+        text = event_text(self._described.parameters, dict(zip(EVENT_VALUES, values, strict=True)))
         return printable(f"{text.label}: {text.description}" if text.values else text.label)
 
     def _count_loss(self, cause: str, text: str, num_frames: int) -> None:

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gateway.messages.coordinate_frame import NO_ROTATION, Quaternion, Vector, with_offset
-from gateway.messages.descriptions.labels import describe
+from gateway.messages.descriptions.labels import describe, event_time_us
 from gateway.messages.descriptions.source_frame import quaternion_of, unknown_unit_text
 from gateway.messages.host_time import now_utime
 from gateway.messages.ros2.encode import (
@@ -29,7 +29,7 @@ from gateway.messages.ros2.encode import (
     ros_stamp,
     tf_message,
 )
-from gateway.messages.ros2.events import event_message, event_utime
+from gateway.messages.ros2.events import event_message
 from gateway.messages.ros2.labels import MAX_LABELS, Labels, by_index, labels_message
 from gateway.messages.ros2.names import (
     ANALOG,
@@ -372,7 +372,7 @@ class SourceTopics:
         has_times = "timestamp" in (items.dtype.names or ())
         for event in items[:MAX_EVENTS]:
             event_us = int(event["timestamp"]) if has_times else events.timestamp_us
-            happened_utime = event_utime(utime, events.timestamp_us, event_us)
+            happened_utime = event_time_us(utime, events.timestamp_us, event_us)
             message = event_message(self._source, self._described_by.parsed, event, happened_utime)
             encoded.append((topic, message))
 
