@@ -290,6 +290,12 @@ class RollPitchYaw(Section):
     """The angle about z, in degrees."""
 
 
+def check_one_rotation(rotation_xyzw: tuple[float, ...] | None, rotation_deg: RollPitchYaw) -> None:
+    """Raise the error of a section that has both forms of a rotation."""
+    if rotation_xyzw is not None and rotation_deg != RollPitchYaw():
+        raise validation_error("found rotation_xyzw, too; expected one of the two", "rotation_deg")
+
+
 class TransformSettings(Section):
     """From the server's units and axes to the frame of poses: units, scale, up, rotation, translation.
 
@@ -316,6 +322,5 @@ class TransformSettings(Section):
 
     @model_validator(mode="after")
     def _check_rotation(self) -> Self:
-        if self.rotation_xyzw is not None and self.rotation_deg != RollPitchYaw():
-            raise validation_error("found rotation_xyzw, too; expected one of the two", "rotation_deg")
+        check_one_rotation(self.rotation_xyzw, self.rotation_deg)
         return self

@@ -5,9 +5,17 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, TypeAdapter, WrapValidator, model_validator
 
-from gateway.config.section import Section, expects, validation_error, validation_errors
+from gateway.config.section import Section, expects, validation_errors
 from gateway.config.settings import OutputSettings
-from gateway.config.values import FrameId, Metres3, QuaternionXyzw, RollPitchYaw, SourceName, Switch
+from gateway.config.values import (
+    FrameId,
+    Metres3,
+    QuaternionXyzw,
+    RollPitchYaw,
+    SourceName,
+    Switch,
+    check_one_rotation,
+)
 from gateway.messages.ros2.names import DEFAULT_NAMESPACE, MAX_PART_CHARS, PLATE_NAME
 from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.outputs.kind import OutputKind, imported_late
@@ -89,8 +97,7 @@ class OffsetSettings(Section):
 
     @model_validator(mode="after")
     def _check_rotation(self) -> Self:
-        if self.rotation_xyzw is not None and self.rotation_deg != RollPitchYaw():
-            raise validation_error("found rotation_xyzw, too; expected one of the two", "rotation_deg")
+        check_one_rotation(self.rotation_xyzw, self.rotation_deg)
         return self
 
 
