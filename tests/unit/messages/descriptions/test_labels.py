@@ -1,9 +1,10 @@
 """Labels, units and rates of components."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.messages.descriptions.labels import describe, event_labels
+from gateway.messages.descriptions.labels import describe, event_labels, event_time_us
 from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
@@ -70,3 +71,22 @@ def test_ids_of_events_are_decimal_or_hexadecimal() -> None:
     events = tuple(EventDefinition(event_id, label) for event_id, label in ids)
     assert event_labels(Parameters(events=ParametersEvents(events))) == {16: "a", 17: "b", -1: "c", 18: "e"}
     assert event_labels(None) == {}
+
+
+@pytest.mark.parametrize(
+    ("event_us", "expected_us"),
+    [
+        (7_000_000, 500),
+        (6_999_700, 200),
+        (7_000_300, 800),
+        (6_000_000, -999_500),
+        (8_000_000, 1_000_500),
+        (5_999_999, 500),
+        (8_000_001, 500),
+        (0, 500),
+    ],
+)
+def test_an_event_has_its_own_time_if_that_is_within_a_second_of_its_frame(
+    event_us: int, expected_us: int
+) -> None:
+    assert event_time_us(500, 7_000_000, event_us) == expected_us
